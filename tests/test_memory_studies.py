@@ -173,12 +173,12 @@ def test_a_sense_that_sticks_is_alone_over_its_ceiling_and_counts_no_more_once_l
     schedule = Schedule(25, 16, 6e-3, 8, 1.0, 1.0, 0.0)
     rng = np.random.default_rng(0)
     trained = learn_settling(trajectories(reader, train), 64, schedule, rng, lambda: None)
-    model = closed_loop.Settling(reader, trained.network, train)
+    model = closed_loop.LocalNetwork(reader, trained.network, train)
     assert np.mean([model.read_stream(e.stream)[1] ** 2 for e in train]) == pytest.approx(
         1.0, abs=0.1
     )
-    model.ceilings = 1.5 * np.max(
-        [model.read_stream(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0
+    model.ceiling = 1.5 * max(
+        model.read_stream(wandering(n).stream)[2][3:].max() for n in range(20, 24)
     )
     stuck = wandering(30).stream.astype(np.float64)
     stuck[40:, workspace.JOINTS] = stuck[40, workspace.JOINTS]

@@ -10,12 +10,12 @@ from asm_gym.memory.recurrent import (
     Change,
     Eligibility,
     Errors,
-    Weights,
+    RecurrentWeights,
     advance,
     direct,
     direct_synapses,
     follow_eligibility,
-    initial_weights,
+    initial_recurrent_weights,
     local_change,
     outward,
     sense,
@@ -28,12 +28,12 @@ STREAMS = 4
 PRIOR = 2.0
 
 
-def double(weights: Weights) -> Weights:
-    return Weights._make(array.astype(np.float64) for array in weights)
+def double(weights: RecurrentWeights) -> RecurrentWeights:
+    return RecurrentWeights._make(array.astype(np.float64) for array in weights)
 
 
-def random_weights(rng: np.random.Generator) -> Weights:
-    weights = double(initial_weights(HIDDEN, SENSES, MOTOR, rng))
+def random_weights(rng: np.random.Generator) -> RecurrentWeights:
+    weights = double(initial_recurrent_weights(HIDDEN, SENSES, MOTOR, rng))
     exists = direct_synapses(HIDDEN, SENSES, MOTOR)
     return weights._replace(
         W_F=rng.normal(size=weights.W_F.shape) / 3,
@@ -41,7 +41,9 @@ def random_weights(rng: np.random.Generator) -> Weights:
     )
 
 
-def local_total(weights: Weights, rows: np.ndarray, forget: bool = False) -> dict[str, np.ndarray]:
+def local_total(
+    weights: RecurrentWeights, rows: np.ndarray, forget: bool = False
+) -> dict[str, np.ndarray]:
     """The sum of local changes along rows (T, B, R), with the weights held still."""
     norm = np.linalg.norm(weights.W_F, 2)
     inference = Inference(PRIOR, 1.0, PRIOR + norm**2, 4000)
@@ -64,7 +66,7 @@ def local_total(weights: Weights, rows: np.ndarray, forget: bool = False) -> dic
     return total
 
 
-def gradient_through_time(weights: Weights, rows: np.ndarray) -> dict[str, np.ndarray]:
+def gradient_through_time(weights: RecurrentWeights, rows: np.ndarray) -> dict[str, np.ndarray]:
     """-∂/∂w of the mean over streams of Σ_t min_z F_t, by automatic differentiation through every row."""
     torch = pytest.importorskip("torch")
     w = {

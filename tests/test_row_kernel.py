@@ -163,7 +163,7 @@ def test_one_call_gives_what_the_equations_give(dt, batch):
         both(asm, rows[:, first : first + batch], asm.initial_state(batch))
 
 
-@pytest.mark.parametrize("dynamics", ["traces", "settling"])
+@pytest.mark.parametrize("dynamics", ["traces", "settling", "recurrent"])
 def test_streams_that_began_at_different_times_and_named_skills_make_no_difference(dynamics):
     asm, rows, episodes = memory(0.01, dynamics=dynamics)
     name_skills(

@@ -234,7 +234,7 @@ def test_learning_is_that_of_the_published_equations(seed):
     never = np.zeros((3, 1), np.bool_)
     ours = z = np.zeros((3, H))
     for x, u in zip(senses, commands, strict=True):
-        ours, _ = learner.practise(ours, Turn(x, u, own=never, alone=never), 1e-3)
+        ours, _ = learner.practise(ours, Turn(x, u, own=never, alone=never, begins=never), 1e-3)
         z = theirs.learn(z, u, x, 1e-3)
     np.testing.assert_allclose(ours, z, atol=1e-6)
     for name, W in theirs.W.items():
@@ -292,7 +292,8 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
 
 def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     with pytest.raises(
-        ValueError, match=r"^unknown dynamics 'setling'; known: traces, settling; did you mean"
+        ValueError,
+        match=r"^unknown dynamics 'setling'; known: recurrent, traces, settling; did you mean",
     ):
         NeuralASM(sine_spec(), dynamics="setling")
     with pytest.raises(

@@ -1,5 +1,6 @@
-"""The two temporal networks by name, and the training of a whole memory.
+"""The temporal networks by name, and the training of a whole memory.
 
+    recurrent   units that learn how long to remember are carried on, and the state follows from them
     traces      traces of senses and actions are carried on, and the state follows from them
     settling    the state is carried on by learned synapses, and is inferred on every row
 
@@ -23,6 +24,12 @@ import numpy as np
 from asm_gym.memory.association import ChangeLayout
 from asm_gym.memory.association_learning import ALL_TICKS, learn_association
 from asm_gym.memory.learning import Schedule, Trajectory, passes, row_count
+from asm_gym.memory.recurrent import (
+    RecurrentNetwork,
+    RecurrentWeights,
+    learn_recurrent,
+    recurrent_shapes,
+)
 from asm_gym.memory.settling import (
     SettlingNetwork,
     SettlingWeights,
@@ -32,6 +39,7 @@ from asm_gym.memory.settling import (
 from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
 from asm_gym.memory.traces import Network, Weights, learn_traces, weight_shapes
 
+RECURRENT = "recurrent"
 TRACES = "traces"
 SETTLING = "settling"
 
@@ -50,6 +58,14 @@ class Dynamics(NamedTuple):
 
 
 DYNAMICS = {
+    RECURRENT: Dynamics(
+        shapes=recurrent_shapes,
+        weights=RecurrentWeights,
+        network=RecurrentNetwork,
+        learn=learn_recurrent,
+        iterations=5,
+        prior_precision=30.0,
+    ),
     TRACES: Dynamics(
         shapes=weight_shapes,
         weights=Weights,
@@ -73,6 +89,8 @@ def dynamics_of(names: Collection[str]) -> str:
     """Return the dynamics whose arrays have these names."""
     if "W_H" in names:
         return SETTLING
+    if "B_re" in names:
+        return RECURRENT
     return TRACES
 
 

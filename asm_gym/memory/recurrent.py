@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ FASTEST = 0.3  # largest θ at first [rad a row]
 SLOWER = 1 / 3  # learning rate of ν and θ, in that of the weights
 
 
-class Weights(NamedTuple):
+class RecurrentWeights(NamedTuple):
     """The synapses of N recurrent and H hidden units, S senses and A motor; R = S + A + 1, I = 2 N + R.
 
     All are float32.
@@ -77,8 +77,8 @@ def recurrent_units(hidden: int) -> int:
     return max(1, round(UNITS_PER_HIDDEN * hidden))
 
 
-def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of each array of ``Weights`` by name."""
+def recurrent_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each array of ``RecurrentWeights`` by name."""
     predicted = sensory + motor
     row = predicted + 1
     units = recurrent_units(hidden)
@@ -96,14 +96,14 @@ def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int,
 
 
 @inner_kernel
-def multiplier(weights: Weights, i: int) -> tuple[float, float]:
+def multiplier(weights: RecurrentWeights, i: int) -> tuple[float, float]:
     """Return the real and the imaginary part of λ of unit i."""
     size = np.exp(-np.exp(weights.decay[i]))
     return size * np.cos(weights.turn[i]), size * np.sin(weights.turn[i])
 
 
 @kernel
-def advance(m: Array, rows: Array, weights: Weights) -> Array:
+def advance(m: Array, rows: Array, weights: RecurrentWeights) -> Array:
     """Return m_t (B, I) from m_{t-1} and the rows r_t (B, R)."""
     N = len(weights.decay)
     drive_re = outward(rows, weights.B_re)
@@ -135,7 +135,7 @@ class Eligibility(NamedTuple):
     decay_im: Array  # (B, N) Im e
 
     @classmethod
-    def none(cls, streams: int, weights: Weights) -> Eligibility:
+    def none(cls, streams: int, weights: RecurrentWeights) -> Eligibility:
         """Return that before an episode."""
         synapses = (streams, *weights.B_re.shape)
         units = synapses[:2]
@@ -153,7 +153,9 @@ class RecurrentChange(NamedTuple):
 
 
 @kernel
-def recurrent_change(downhill: Array, eligible: Eligibility, weights: Weights) -> RecurrentChange:
+def recurrent_change(
+    downhill: Array, eligible: Eligibility, weights: RecurrentWeights
+) -> RecurrentChange:
     """Return the change along -∂F/∂m (B, I) of the rows that are eligible."""
     N, R = weights.B_re.shape
     batch = downhill.shape[0]
@@ -184,7 +186,9 @@ def recurrent_change(downhill: Array, eligible: Eligibility, weights: Weights) -
 
 
 @kernel
-def follow_eligibility(eligible: Eligibility, m: Array, rows: Array, weights: Weights) -> None:
+def follow_eligibility(
+    eligible: Eligibility, m: Array, rows: Array, weights: RecurrentWeights
+) -> None:
     """Advance the eligibility in place by the rows r_t (B, R), from m_{t-1} (B, I)."""
     N, R = weights.B_re.shape
     for i in range(N):
@@ -208,7 +212,7 @@ def follow_eligibility(eligible: Eligibility, m: Array, rows: Array, weights: We
 @lru_cache(maxsize=8)
 def direct_synapses(hidden: int, sensory: int, motor: int) -> Array:
     """Return the mask (S + A, I + A + 1) of W_D: 0 from an action to its own prediction, else 1."""
-    exists = np.ones(weight_shapes(hidden, sensory, motor)["W_D"], np.float32)
+    exists = np.ones(recurrent_shapes(hidden, sensory, motor)["W_D"], np.float32)
     exists[sensory:, exists.shape[1] - motor - 1 : -1] = 0.0
     return exists
 
@@ -224,9 +228,16 @@ def sense(z: Array, W_F: Array) -> Array:
     return outward(activate(z), W_F)
 
 
+class Readout(NamedTuple):
+    """The synapses by which senses and action are predicted."""
+
+    W_F: Array  # (S + A, H) from the state
+    W_D: Array  # (S + A, I + A + 1) from what is carried on, action and a constant 1
+
+
 @inner_kernel
-def carry(
-    m: Array, rows: ScaledRows, weights: Weights, inference: Inference, wants_context: bool
+def remember(
+    m: Array, rows: ScaledRows, weights: RecurrentWeights, inference: Inference, wants_context: bool
 ) -> tuple[Array, Array]:
     """Return f(μ_t) (B, H), 0 unless wanted or a sense is missing, and m_t (B, I), after the next rows of B streams."""
     sensed = beside(rows.senses, rows.commands)
@@ -235,17 +246,17 @@ def carry(
     if wants_context or not whole:
         mu = outward(m, weights.W_C)
     if not whole:
-        fill_missing(sensed, m, mu, rows, weights, inference)
+        fill_missing(sensed, m, mu, rows, Readout(weights.W_F, weights.W_D), inference)
     return activate(mu), advance(m, sensed, weights)
 
 
 @inner_kernel
 def fill_missing(
-    sensed: Array, m: Array, mu: Array, rows: ScaledRows, weights: Weights, inference: Inference
+    sensed: Array, m: Array, mu: Array, rows: ScaledRows, readout: Readout, inference: Inference
 ) -> None:
     """Write what is inferred of missing senses into ``sensed`` (B, S + A + 1), from m (B, I) and μ (B, H)."""
     S = rows.senses.shape[1]
-    past = outward(beside(m, rows.commands), weights.W_D)  # (B, S + A)
+    past = outward(beside(m, rows.commands), readout.W_D)  # (B, S + A)
     left = np.empty_like(past)
     precision = np.empty_like(past)
     for n in range(past.shape[0]):
@@ -255,7 +266,7 @@ def fill_missing(
             if i < S:
                 precision[n, i] *= rows.seen[n, i]
 
-    state = sense(infer(mu, left, weights.W_F, precision, inference), weights.W_F)
+    state = sense(infer(mu, left, readout.W_F, precision, inference), readout.W_F)
     for n in range(past.shape[0]):
         for i in range(S):
             if rows.seen[n, i] == 0:
@@ -265,7 +276,7 @@ def fill_missing(
 class RecurrentNetwork(TemporalNetwork):
     """The network of recurrent units; arguments as in ``TemporalNetwork``."""
 
-    weights: Weights
+    weights: Any
 
     @property
     def hidden_size(self) -> int:
@@ -278,6 +289,10 @@ class RecurrentNetwork(TemporalNetwork):
     def at_rest(self, batch: int) -> NDArray[np.float32]:
         return np.zeros((batch, self.weights.W_C.shape[1]), np.float32)
 
+    def advance(self, m: Array, rows: Array) -> Array:
+        """Return m_t (B, I) from m_{t-1} and the rows r_t (B, R)."""
+        return advance(m, rows, self.weights)
+
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         w = self.weights
         mu = outward(c, w.W_C)
@@ -286,9 +301,9 @@ class RecurrentNetwork(TemporalNetwork):
         precision = self.inference.sensory_precision * np.hstack([seen, np.ones_like(action)])
         z = infer(mu, np.hstack([x, action]) - past, w.W_F, precision, self.inference)
         inferred = past + sense(z, w.W_F)
-        whole = np.where(seen > 0, x, inferred[:, : x.shape[1]])
-        carried = advance(c, np.hstack([whole, u]), w)
-        return Step(mu, past + sense(mu, w.W_F), z, carried, whole)
+        senses = np.where(seen > 0, x, inferred[:, : x.shape[1]])
+        carried = self.advance(c, np.hstack([senses, u]))
+        return Step(mu, past + sense(mu, w.W_F), z, carried, senses)
 
     def run_on(self, c: Array) -> Step:
         w = self.weights
@@ -301,7 +316,8 @@ class RecurrentNetwork(TemporalNetwork):
         u[:, :-1] = (direct(c, u, w.W_D) + state)[:, sensory:]
         expected = direct(c, u, w.W_D) + state
         senses = expected[:, :sensory]
-        return Step(mu, expected, mu, advance(c, np.hstack([senses, u]), w), senses)
+        carried = self.advance(c, np.hstack([senses, u]))
+        return Step(mu, expected, mu, carried, senses)
 
 
 # ------------------------------------------------------------------ learning
@@ -319,15 +335,17 @@ class Change(NamedTuple):
     W_D: Array
 
 
-def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
+def initial_recurrent_weights(
+    hidden: int, sensory: int, motor: int, rng: np.random.Generator
+) -> RecurrentWeights:
     """Return random weights of about unit gain into the state and of gain 0.1 out of it, and no direct ones.
 
     Times of the units lie evenly on a logarithmic scale.
     """
-    shapes = weight_shapes(hidden, sensory, motor)
+    shapes = recurrent_shapes(hidden, sensory, motor)
     units = shapes["decay"][0]
     forgetting = np.geomspace(-np.log(SHORTEST), -np.log(LONGEST), units)
-    weights = Weights._make(np.zeros(shape, np.float32) for shape in shapes.values())
+    weights = RecurrentWeights._make(np.zeros(shape, np.float32) for shape in shapes.values())
     weights.decay[:] = np.log(forgetting)
     weights.turn[:] = rng.uniform(0.0, FASTEST, units)
     weights.gain[:] = np.sqrt(1 - np.exp(-2 * forgetting))
@@ -346,7 +364,7 @@ class Errors(NamedTuple):
 
 
 def local_change(
-    m: Array, u: Array, z: Array, errors: Errors, eligible: Eligibility, weights: Weights
+    m: Array, u: Array, z: Array, errors: Errors, eligible: Eligibility, weights: RecurrentWeights
 ) -> Change:
     """Apply the local learning rules to ``m`` (B, I), action and 1 ``u`` (B, A + 1) and the state ``z`` (B, H)."""
     motor = u.shape[1] - 1
@@ -366,12 +384,14 @@ def local_change(
 class RecurrentLearner(Learner):
     """The network of recurrent units as it learns."""
 
-    weights: Weights
+    weights: RecurrentWeights
     learned = Change._fields
     early = False
     scalar = np.float32
 
-    def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
+    def __init__(
+        self, weights: RecurrentWeights, schedule: Schedule, rng: np.random.Generator
+    ) -> None:
         super().__init__(weights, schedule, rng)
         self.rng = rng
         self.eligible = Eligibility.none(schedule.batch_size, weights)
@@ -429,6 +449,6 @@ def learn_recurrent(
     """Learn the synapses through time; see ``temporal.Learn``."""
     sensory = trajectories[0].senses.shape[1]
     motor = trajectories[0].commands.shape[1] - 1
-    weights = initial_weights(hidden, sensory, motor, rng)
+    weights = initial_recurrent_weights(hidden, sensory, motor, rng)
     learner = RecurrentLearner(weights, schedule, rng)
     return learned_network(RecurrentNetwork, learner, trajectories, rng, tick)

@@ -41,7 +41,8 @@ from asm_gym.memory.learning import (
     Turn,
     coincidence,
 )
-from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, learned_network
+from asm_gym.memory.recurrent import Readout, RecurrentNetwork, direct, fill_missing, sense
+from asm_gym.memory.temporal import Trained, learned_network
 from asm_gym.scaling import ScaledRows
 
 DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float32)  # λ (K,)
@@ -108,23 +109,6 @@ def direct_synapses(sensory: int, motor: int) -> Array:
     return exists
 
 
-@kernel
-def expect(c: Array, W_C: Array) -> Array:
-    """Return μ_t (B, H) from the traces ``c`` (B, I)."""
-    return outward(c, W_C)
-
-
-def direct(c: Array, u: Array, W_D: Array) -> Array:
-    """Return the prediction (B, S + A) past the state, from traces ``c`` (B, I) and action and 1 ``u`` (B, A + 1)."""
-    return outward(np.hstack([c, u]), W_D)
-
-
-@kernel
-def sense(z: Array, W_F: Array) -> Array:
-    """Return what the state ``z`` (B, H) adds to it (B, S + A)."""
-    return outward(activate(z), W_F)
-
-
 @inner_kernel
 def carry(
     c: Array, rows: ScaledRows, weights: Weights, inference: Inference, wants_context: bool
@@ -136,73 +120,15 @@ def carry(
     if wants_context or not whole:
         mu = outward(c, weights.W_C)
     if not whole:
-        fill_missing(sensed, c, mu, rows, weights, inference)
+        fill_missing(sensed, c, mu, rows, Readout(weights.W_F, weights.W_D), inference)
     return activate(mu), advance(c, sensed, weights.gains)
 
 
-@inner_kernel
-def fill_missing(
-    sensed: Array, c: Array, mu: Array, rows: ScaledRows, weights: Weights, inference: Inference
-) -> None:
-    """Write what is inferred of missing senses into ``sensed`` (B, S + A + 1), from c (B, I) and μ (B, H)."""
-    S = rows.senses.shape[1]
-    past = outward(beside(c, rows.commands), weights.W_D)  # (B, S + A)
-    left = np.empty_like(past)
-    precision = np.empty_like(past)
-    for n in range(past.shape[0]):
-        for i in range(past.shape[1]):
-            left[n, i] = sensed[n, i] - past[n, i]
-            precision[n, i] = inference.sensory_precision
-            if i < S:
-                precision[n, i] *= rows.seen[n, i]
-
-    state = sense(infer(mu, left, weights.W_F, precision, inference), weights.W_F)
-    for n in range(past.shape[0]):
-        for i in range(S):
-            if rows.seen[n, i] == 0:
-                sensed[n, i] = past[n, i] + state[n, i]
-
-
-class Network(TemporalNetwork):
+class Network(RecurrentNetwork):
     """The temporal network by traces; arguments as in ``TemporalNetwork``."""
 
-    weights: Weights
-
-    @property
-    def hidden_size(self) -> int:
-        return int(self.weights.W_C.shape[0])
-
-    @property
-    def motor(self) -> int:
-        return int(self.weights.W_D.shape[1] - self.weights.W_C.shape[1] - 1)
-
-    def at_rest(self, batch: int) -> NDArray[np.float32]:
-        return np.zeros((batch, self.weights.W_C.shape[1]), np.float32)
-
-    def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
-        w = self.weights
-        mu = expect(c, w.W_C)
-        past = direct(c, u, w.W_D)
-        action = u[:, :-1]
-        precision = self.inference.sensory_precision * np.hstack([seen, np.ones_like(action)])
-        z = infer(mu, np.hstack([x, action]) - past, w.W_F, precision, self.inference)
-        inferred = past + sense(z, w.W_F)
-        whole = np.where(seen > 0, x, inferred[:, : x.shape[1]])
-        traces = advance(c, np.hstack([whole, u]), w.gains)
-        return Step(mu, past + sense(mu, w.W_F), z, traces, whole)
-
-    def run_on(self, c: Array) -> Step:
-        w = self.weights
-        sensory = w.W_F.shape[0] - self.motor
-        mu = expect(c, w.W_C)
-        state = sense(mu, w.W_F)
-        u = np.zeros((len(c), self.motor + 1), np.float32)
-        u[:, -1] = 1.0
-        # No synapse leads from an action to itself.
-        u[:, :-1] = (direct(c, u, w.W_D) + state)[:, sensory:]
-        expected = direct(c, u, w.W_D) + state
-        traces = advance(c, np.hstack([expected[:, :sensory], u]), w.gains)
-        return Step(mu, expected, mu, traces, expected[:, :sensory])
+    def advance(self, m: Array, rows: Array) -> Array:
+        return advance(m, rows, self.weights.gains)
 
 
 class HebbianChange(NamedTuple):
@@ -257,7 +183,7 @@ class TracesLearner(Learner):
         pi_z = inference.prior_precision
         pi_x = inference.sensory_precision
         sensory = turn.senses.shape[1]
-        mu = expect(state, w.W_C)
+        mu = outward(state, w.W_C)
         taken = turn.commands
         if turn.own.any():
             expected = direct(state, turn.commands, w.W_D) + sense(mu, w.W_F)

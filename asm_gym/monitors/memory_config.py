@@ -24,14 +24,15 @@ class MemoryConfig:
 
     Args:
         iterations: largest number of inference steps; inference ends earlier when the state stops changing. By default
-            5 with traces (in learning and with a missing sense; a complete row needs none), and 20 with settling, on
-            every row.
+            20 on every row with settling, else 5 in learning and with a missing sense: a complete row needs none.
         learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H for
             larger H, so that the input of a unit does not change faster with more synapses.
         batch_size: episodes in a batch of learning.
-        prior_precision: Π_z, trust in the prediction. By default 30 with traces (a higher value brings local learning
-            closer to the gradient), and 1 with settling, where the senses must move the state.
+        prior_precision: Π_z, trust in the prediction. By default 1 with settling, where the senses must move the state,
+            else 30: a higher value brings local learning closer to the gradient.
         sensory_precision: Π_x, trust in the senses.
+        noise: standard deviation of the noise on what recurrent units carry on while they learn, in standardised rows;
+            0.3 for a memory that acts or runs on alone. The other networks learn without.
         gains: a in (0, 1], weights of the newest step in the evidence; several, for sudden and for slow faults.
         bound: ν > 0, largest number of standard deviations that an error counts, to limit the effect of short knocks.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
@@ -43,6 +44,7 @@ class MemoryConfig:
     batch_size: int = 64
     prior_precision: float | None = None
     sensory_precision: float = 1.0
+    noise: float = 0.0
     gains: Sequence[float] = GAINS
     bound: float = BOUND
     shrinkage: float = 1e-3
@@ -67,6 +69,7 @@ class MemoryConfig:
             "sensory_precision": check_number(
                 "sensory_precision", self.sensory_precision, above=0.0
             ),
+            "noise": check_number("noise", self.noise, low=0.0),
             "gains": tuple(self.gains),  # EvidenceDetection checks all of ``OF_EVIDENCE``
         }
         if self.iterations is not None:

@@ -34,6 +34,7 @@ from asm_gym.detection.repetition import (
 from asm_gym.memory.association import Association, Wiring, normalised_errors
 from asm_gym.memory.energy import Inference
 from asm_gym.memory.readout import add_up
+from asm_gym.memory.recurrent import RecurrentWeights, recurrent_shapes, remember
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
 from asm_gym.memory.traces import Weights, carry, weight_shapes
@@ -41,13 +42,21 @@ from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.monitor_state import MonitorState
 from asm_gym.scaling import RowScale, ScaledRows, StreamScaler, read_rows
 
+KINDS_OF_WEIGHTS: dict[Any, Any] = {
+    Weights: weight_shapes,
+    SettlingWeights: settling_shapes,
+    RecurrentWeights: recurrent_shapes,
+}
+"""The records of weights that a temporal network may have, and their shapes."""
+
 
 class RowWeights(NamedTuple):
     """The learned numbers of a memory, as compiled code reads them."""
 
-    traces: Weights  # of the temporal network; 0 where it settles
-    settling: SettlingWeights  # of the temporal network; 0 where it has traces
-    settles: bool
+    traces: Weights
+    settling: SettlingWeights
+    recurrent: RecurrentWeights
+    dynamics: int  # which of the three the temporal network has, the others being 0
     association: Association
     wiring: Wiring
     W_K: NDArray[np.float32]  # (K, M + H) from units and context to the evidence for each skill
@@ -60,17 +69,17 @@ def row_weights(
     network: TemporalNetwork, scaler: StreamScaler, learned: Mapping[str, NDArray[Any]]
 ) -> RowWeights:
     """Return the learned numbers of a memory; ``learned`` has W_K and b_K where skills have names."""
-    traces: Any = map(np.zeros, weight_shapes(1, 1, 1).values())
-    settling: Any = map(np.zeros, settling_shapes(1, 1, 1).values())
-    settles = isinstance(network.weights, SettlingWeights)
-    if settles:
-        settling = network.weights
-    else:
-        traces = network.weights
+    unused: dict[Any, Any] = {
+        kind: kind._make(np.zeros(shape, np.float32) for shape in shapes(1, 1, 1).values())
+        for kind, shapes in KINDS_OF_WEIGHTS.items()
+    }
+    kind: Any = type(network.weights)
+    used = unused | {kind: kind._make(map(single, network.weights))}
     return RowWeights(
-        traces=Weights._make(map(single, traces)),
-        settling=SettlingWeights._make(map(single, settling)),
-        settles=settles,
+        traces=used[Weights],
+        settling=used[SettlingWeights],
+        recurrent=used[RecurrentWeights],
+        dynamics=list(KINDS_OF_WEIGHTS).index(kind),
         association=Association._make(map(single, network.association)),
         wiring=Wiring.of(network.association, scaler),
         W_K=single(learned.get("W_K", np.zeros((0, 0)))),
@@ -337,8 +346,10 @@ def carry_on(
 @partial(inner, inlined=True)
 def follow(weights: RowWeights, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
     """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
-    if weights.settles:
+    if weights.dynamics == 1:
         return settle(traces, reading, weights.settling, weights.inference)
+    if weights.dynamics == 2:
+        return remember(traces, reading, weights.recurrent, weights.inference, wants_context)
     return carry(traces, reading, weights.traces, weights.inference, wants_context)
 
 

@@ -66,24 +66,34 @@ class GroupEnergy:
     def strengths(self, errors: Floats) -> Floats:
         """Return the evidence in each error (T, gains, N) at each row of an episode (T, N)."""
         self.begin()
-        return np.array([self._strength(error) for error in errors])
+        all_seen = np.ones(errors.shape[1], np.bool_)
+        return np.array([self._strength(error, all_seen) for error in errors])
 
     def begin(self) -> None:
         """Forget the past."""
         self.evidence = Evidence.start(1, len(GAINS), self.members.shape[1])
 
-    def _strength(self, error: Floats) -> Floats:
+    def _strength(self, error: Floats, seen: NDArray[np.bool_]) -> Floats:
         before = self.evidence
         white = bounded(error[None] @ self.whitening, BOUND)
         vector = before.vector + GAINS[:, None] * (white[:, None] - before.vector)
+        vector = np.where(seen, vector, 0.0)
         self.evidence = before._replace(vector=vector, steps=before.steps + 1)
         return strength(self.evidence, GAINS)[0]
 
-    def add(self, error: Floats) -> Floats:
-        """Return the energy of each group (G,) after a row's errors (N,)."""
-        ratios = (self._strength(error) / self.worst) ** self.tail
+    def add(self, error: Floats, seen: NDArray[np.bool_]) -> Floats:
+        """Return the energy of each group (G,) after a row's errors (N,); what is not seen has none."""
+        ratios = (self._strength(error, seen) / self.worst) ** self.tail
         energies = [pool(ratios[:, own].reshape(1, -1))[0][0] for own in self.members]
         return np.array(energies)
+
+
+class Prediction(NamedTuple):
+    """What a network made of a row."""
+
+    state: Floats  # (H,) f(μ)
+    error: Floats  # (N,) [σ]; 0 in the first row, and where nothing is seen
+    seen: NDArray[np.bool_]  # (N,)
 
 
 class LocalNetwork:
@@ -113,8 +123,8 @@ class LocalNetwork:
         self.bias = np.zeros(len(columns))
         self.least = np.zeros(len(columns))
         steps = [self._steps(e.stream) for e in episodes]
-        states = np.concatenate([state for state, _ in steps])
-        squares = np.concatenate([error for _, error in steps]) ** 2
+        states = np.array([step.state for episode in steps for step in episode])
+        squares = np.array([step.error for episode in steps for step in episode]) ** 2
         self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
         log_variance = np.log(squares + np.exp(self.least))
         ridge = Ridge(PRIOR).fit(states, log_variance)
@@ -123,23 +133,21 @@ class LocalNetwork:
         self.W = ridge.coef_
         self.bias = ridge.intercept_ + np.log(np.mean(ratios, axis=0))
 
-        errors = [self._steps(e.stream)[1] for e in episodes]
+        errors = [np.array([step.error for step in self._steps(e.stream)]) for e in episodes]
         members = GROUP_OF[columns] == np.array(GROUPS)[:, None]  # (G, N)
         self.energy = GroupEnergy(errors, members)
 
-    def _steps(self, stream: NDArray[Any]) -> tuple[Floats, Floats]:
-        """Return the states (T, H) and errors (T, N) [σ] of all rows of a stream (T, D)."""
+    def _steps(self, stream: NDArray[Any]) -> list[Prediction]:
+        """Return the predictions of all rows of a stream (T, D)."""
         self._forget()
-        steps = [self._step(row) for row in np.asarray(stream, np.float64)]
-        states, errors = zip(*steps, strict=True)
-        return np.array(states), np.array(errors)
+        return [self._step(row) for row in np.asarray(stream, np.float64)]
 
     def _forget(self) -> None:
         self.c = self.network.at_rest(1)
         self.rows: list[Floats] = []
 
-    def _step(self, row: Floats) -> tuple[Floats, Floats]:
-        """Read a row (D,), NaN where left out; return the state (H,) and the errors (N,) [σ], 0 in the first row."""
+    def _step(self, row: Floats) -> Prediction:
+        """Read a row (D,), NaN where left out."""
         now = row[None]
         is_first = not self.rows
         if is_first:
@@ -152,10 +160,14 @@ class LocalNetwork:
         state = np.tanh(step.mu[0])
 
         difference = np.hstack([scaled.senses, scaled.commands[:, :-1]]) - step.expected
-        difference[:, : self.reader.size] *= scaled.seen
+        commanded = np.ones((1, difference.shape[1] - self.reader.size))
+        seen = np.hstack([scaled.seen, commanded])[0] > 0
         log_variance = np.maximum(self.W @ state + self.bias, self.least)
         sigma = np.exp(0.5 * log_variance)
-        return state, difference[0] / sigma * (not is_first)
+        if is_first:
+            seen[:] = False
+        error = np.where(seen, difference[0] / sigma, 0.0)
+        return Prediction(state, error, seen)
 
     def begin(self) -> None:
         """Forget the past."""
@@ -164,8 +176,9 @@ class LocalNetwork:
 
     def read(self, row: Floats) -> Reading:
         """Read a row (D,), NaN where left out; nothing surprises in the first."""
-        state, error = self._step(row)
-        return Reading(state, error, self.energy.add(error) / self.ceiling)
+        step = self._step(row)
+        energy = self.energy.add(step.error, step.seen)
+        return Reading(step.state, step.error, energy / self.ceiling)
 
     def read_stream(self, stream: NDArray[Any]) -> Reading:
         """Return the reading of all rows of a stream (T, D)."""

@@ -29,21 +29,25 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
-from asm_gym.memory.energy import STEEPEST, STRIDE, Inference, infer
+from asm_gym.memory.energy import (
+    STEEPEST,
+    STRIDE,
+    Inference,
+    infer,
+    outward,
+)
 from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
+from asm_gym.memory.recurrent import direct, sense
 from asm_gym.memory.traces import (
     DECAYS,
     HebbianChange,
     TracesLearner,
     Weights,
     advance,
-    direct,
     direct_synapses,
-    expect,
     fit_gains,
     hebbian_change,
     initial_weights,
-    sense,
 )
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
@@ -126,7 +130,7 @@ def local(
         runs_on = alone and t >= CUE
         senses = x
         commands = u
-        mu = expect(c, weights.W_C)
+        mu = outward(c, weights.W_C)
         from_state = sense(mu, weights.W_F)
         if runs_on:
             expected = direct(c, u, weights.W_D) + from_state
