@@ -27,7 +27,9 @@ Tick = Callable[[], None]
 
 LONGEST_CUE = 30  # a stream reads fewer rows than this before it may run on alone
 UPDATES = 10_000  # largest number of batches
-RECALL_UPDATES = 50_000  # largest number of batches where streams run on alone
+RECALL_UPDATES = (
+    50_000  # the same of a network that learns to run on alone, by itself or against noise
+)
 # hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
 REFERENCE_WIDTH = 256
 
@@ -267,6 +269,6 @@ def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
     """Return the number of passes over all episodes: ``epochs``, fewer with very many episodes."""
     updates = row_count(trajectories) / schedule.batch_size
     most = UPDATES
-    if schedule.free_running_probability > 0:
+    if schedule.free_running_probability > 0 or schedule.noise > 0:
         most = RECALL_UPDATES
     return max(1, min(schedule.epochs, round(most / updates)))

@@ -60,6 +60,10 @@ class LocalTraining:
     gain: float = 1.0
     # one of ``DYNAMICS``
     dynamics: str = TRACES
+    # probability that a stream runs on alone in training, at the end
+    free_running: float = FREE
+    # noise on what recurrent units carry on in training
+    noise: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,8 @@ class ExpressionMemory(Expresser):
             iterations=dynamics.iterations,
             prior_precision=dynamics.prior_precision,
             sensory_precision=1.0,
-            free_running_probability=FREE,
+            free_running_probability=settings.free_running,
+            noise=settings.noise,
         )
         learn = dynamics.learn
         if settings.dynamics == TRACES:
