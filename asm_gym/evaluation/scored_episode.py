@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode, spans
+from asm_gym.data.episode import Episode
 from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.evaluation.defaults import TRANSIENT
+from asm_gym.readings import spans
 
 Floats = NDArray[np.floating[Any]]
 
