@@ -201,7 +201,7 @@ class RobosuiteEnv(SteppedEnv):
         """The strictest contact limits of the arms, by ``asm_gym.envs.robots``."""
         first, *others = (robot_named(name).contact_limits for name in self.robots)
         for limits in others:
-            first = first.and_those_of(limits, self.felt_channels)
+            first = first.strictest_with(limits, self.felt_channels)
         return first
 
     @property

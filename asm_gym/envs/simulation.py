@@ -138,7 +138,7 @@ class Simulation:
         if limits is None:
             return
         if limits is not self._limits_set:
-            self._limits.load_limits[self._limited] = limits.most(limited)
+            self._limits.load_limits[self._limited] = limits.limit_of_each(limited)
             self._limits_set = limits
         self._limits.status.armed = True
         self._limits.status.stops = limits.stays

@@ -88,7 +88,7 @@ class SpeedLimiter:
         return slow_action
 
     def _bind(self, limits: ContactLimits) -> None:
-        beside_base = limits.stricter(1.0, limits.hand_speed / 2)
+        beside_base = limits.reduced(1.0, limits.hand_speed / 2)
         self._limits = limits
         self._bound: Bound = bind(
             self._views,

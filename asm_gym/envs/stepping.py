@@ -76,7 +76,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             if self.contact_limits is None:
                 self.contact_limits = own
             elif own is not None:
-                self.contact_limits = self.contact_limits.and_those_of(own, self.felt_channels)
+                self.contact_limits = self.contact_limits.strictest_with(own, self.felt_channels)
 
     def _run(self, action: NDArray[np.float32]) -> None:
         """Run the substeps of a control step, and read the rows of the stream before its end."""
