@@ -149,7 +149,7 @@ class Simulation:
         Args:
             action: (A,) in robosuite's units.
             hold: the arms are to stay, which no action says: one of no change follows a push, a torque of zero brakes
-                nothing. So they are braked beneath their controllers (``control.brake``).
+                nothing. So they are braked beneath their controllers (``controllers.brake``).
         """
         held = self._goals.held
         if hold:

@@ -12,7 +12,7 @@ motion is m |v|, with the reflected mass 1/m = nᵀ J M⁻¹ Jᵀ n, n = v/|v| (
 stretched.
 
 Where actions mean something else they stay as they are, and a brake slows the arm down beneath its controller once it
-is too fast (``control.slow_down``).
+is too fast (``controllers.slow_down``).
 """
 
 from __future__ import annotations
