@@ -230,7 +230,7 @@ def _sources_in(name: str, file: Path, hints: SchemaHints) -> Iterator[Source]:
     with file.open("rb") as opened:
         if opened.read(len(LFS_POINTER)) == LFS_POINTER:
             raise ValueError("it is a pointer of Git LFS and not the file itself: run git lfs pull")
-    if file.suffix == ".npz" and HEADER in zipfile.ZipFile(file).namelist():  # one of ours
+    if file.suffix == ".npz" and _is_own_episode(file):
         yield Source(name=name, episode=load_episode(file))
     elif file.suffix in HDF5:
         for part, (columns, rate) in read_hdf5(file).items():
@@ -243,6 +243,12 @@ def _sources_in(name: str, file: Path, hints: SchemaHints) -> Iterator[Source]:
     else:
         columns = FILES[file.suffix](file, hints.columns)
         yield Source(name=name, columns=laid_out(columns), file=str(file))
+
+
+def _is_own_episode(file: Path) -> bool:
+    """Return whether an ``.npz`` is a checkpoint of ours, and not only arrays."""
+    with zipfile.ZipFile(file) as archive:
+        return HEADER in archive.namelist()
 
 
 def _files_at(path: Path) -> dict[str, Path]:
