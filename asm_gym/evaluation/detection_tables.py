@@ -126,15 +126,16 @@ def _false_alarms(m: DetectionMetrics) -> str:
 
 def monitors_table(result: BenchmarkResult) -> Table:
     """Return the monitors side by side, the ideal observer on top."""
-    failed, crashed = result.left_out
+    left_out = result.left_out
     caption = (
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds and severities "
         "of fault that an ideal observer can detect; thresholds from separate nominal episodes, "
         f"delays and alarms at a false-alarm rate of {100 * result.rate:g} % of episodes; in "
         "brackets 95 % intervals over resampled scenes and calibration episodes. AUROC: against "
         "nominal episodes over the same steps. Needs: calibration episodes for that rate, where "
-        f"there were fewer. Left out: nominal episodes in which the policy failed ({failed}) or "
-        f"crashed ({crashed}), and faults in such scenes."
+        "there were fewer. Left out: nominal episodes in which the policy failed "
+        f"({left_out.failed_episodes}) or crashed ({left_out.crashed_scenes}), and faults in such "
+        "scenes."
     )
     hidden = [_in_words(kind) for kind, is_visible in result.visible.items() if not is_visible]
     if hidden:

@@ -15,7 +15,7 @@ import numpy as np
 from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import EPISODE, HOUR, conformal_episodes
-from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
+from asm_gym.evaluation.comparison import BenchmarkResult, LeftOut, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration
@@ -40,7 +40,7 @@ class Recordings(NamedTuple):
 
     # by role, without failed healthy episodes, and without scenes in which the robot crashes
     roles: dict[str, list[Episode]]
-    left_out: tuple[int, int]  # numbers of healthy episodes that failed, and of scenes with a crash
+    left_out: LeftOut
     # all of the role nominal, failed ones too: a faulty episode equals its twin until the onset
     twins: list[Episode]
 
@@ -64,7 +64,11 @@ class Recordings(NamedTuple):
                     "there is nothing normal to learn or to test on"
                 )
         twins = [r for r in recordings if r.labelled.role == "nominal"]
-        return cls(roles=roles, left_out=(failed, len(crashed)), twins=twins)
+        return cls(
+            roles=roles,
+            left_out=LeftOut(failed_episodes=failed, crashed_scenes=len(crashed)),
+            twins=twins,
+        )
 
 
 def scenes_with_crash(recordings: Sequence[Episode]) -> set[tuple[str, int]]:

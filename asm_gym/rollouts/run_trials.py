@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -39,8 +39,6 @@ from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
 from asm_gym.wrappers.faults import FaultInjection
-
-Item = TypeVar("Item")
 
 UNUSED_STAGE = 99  # stage of the random draws whose seeds no recorded episode has
 
@@ -198,28 +196,14 @@ def record_missing(
 ) -> list[Path]:
     """Record the trials that are not in ``folder`` yet; return the files of all."""
     folder = folder.resolve()
-    return _record_missing(
-        trials,
-        lambda trial: record_stream(trial, config),
-        lambda trial: folder / trial.label.path,
-        workers,
-        progress,
-    )
 
+    def file_of(trial: Trial) -> Path:
+        return folder / trial.label.path
 
-def _record_missing(
-    items: Sequence[Item],
-    record: Callable[[Item], Episode],
-    file_of: Callable[[Item], Path],
-    workers: int,
-    progress: Progress | None,
-) -> list[Path]:
-    """Record the items without a file; return the files of all."""
+    def record(trial: Trial) -> Path:
+        return save_episode(file_of(trial), record_stream(trial, config))
 
-    def make(item: Item) -> Path:
-        return save_episode(file_of(item), record(item))
-
-    return make_missing(make, items, file_of, workers, progress)
+    return make_missing(record, trials, file_of, workers, progress)
 
 
 @typed
@@ -289,16 +273,17 @@ def collect_to(
     """Record the episodes that are not in ``folder`` yet; return the files of all."""
     folder = folder.resolve()
     spec = env_spec(env_id)
-    return _record_missing(
-        seeds,
-        lambda seed: record_episode(seed, spec, config),
-        lambda seed: folder / f"{seed}.npz",
-        workers,
-        progress,
-    )
+
+    def file_of(seed: int) -> Path:
+        return folder / f"{seed}.npz"
+
+    def record(seed: int) -> Path:
+        return save_episode(file_of(seed), record_episode(seed, spec, config))
+
+    return make_missing(record, seeds, file_of, workers, progress)
 
 
-def check(env_id: str, config: RolloutConfig) -> None:
+def check_config(env_id: str, config: RolloutConfig) -> None:
     """Make the environment and the policy once, so that what they refuse is raised before anything runs."""
     policy_for(config.policy, StreamRecorder(environment(env_id, config.settings)), seed=0)
 
