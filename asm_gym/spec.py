@@ -239,7 +239,7 @@ class StreamSpec:
                     f"the {name} space must be numbers to be read as a stream, got {space}"
                 )
         motor = Channel("action", spaces.flatdim(action), group=MOTOR)
-        return cls((*_channels_of_space("observation", observation), motor), dt, "spaces")
+        return cls((*_channels_of_space(observation), motor), dt, "spaces")
 
 
 def _channel_difference(own: Channel, other: Channel) -> list[str]:
@@ -259,18 +259,15 @@ def _channel_from_json(saved: dict[str, Any]) -> Channel:
     return Channel(**saved | {"elements": elements, "stops": stops})
 
 
-def _channels_of_space(name: str, space: spaces.Space[Any]) -> list[Channel]:
+def _channels_of_space(space: spaces.Space[Any], keys: tuple[str, ...] = ()) -> list[Channel]:
     """Return a channel for each key of a dict, in Gymnasium's order of flattening; one of anything else."""
     if isinstance(space, spaces.Dict):
-        prefix = f"{name}."
-        if name == "observation":
-            prefix = ""
-        parts = [_channels_of_space(f"{prefix}{key}", part) for key, part in space.items()]
+        parts = [_channels_of_space(part, (*keys, str(key))) for key, part in space.items()]
         return list(chain.from_iterable(parts))
     size = spaces.flatdim(space)
     if not size:
         return []
-    return [Channel(name, size)]
+    return [Channel(".".join(keys) or "observation", size)]
 
 
 def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:

@@ -23,7 +23,13 @@ from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.memory_config import OF_EVIDENCE, MemoryConfig
+from asm_gym.monitors.memory_config import (
+    ASSOCIATION_UNITS,
+    EPOCHS,
+    HIDDEN_UNITS,
+    OF_EVIDENCE,
+    MemoryConfig,
+)
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor_files import restored
 from asm_gym.monitors.monitor_protocol import Progress, Surprise
@@ -88,9 +94,9 @@ class NeuralASM(CalibratedMonitor):
     def __init__(
         self,
         spec: StreamSpec,
-        hidden_size: int = 256,
-        association_size: int = 480,
-        epochs: int = 40,
+        hidden_size: int = HIDDEN_UNITS,
+        association_size: int = ASSOCIATION_UNITS,
+        epochs: int = EPOCHS,
         free_running_probability: float = 0.0,
         habituates: bool = True,
         dynamics: str = TRACES,
