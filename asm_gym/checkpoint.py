@@ -27,10 +27,11 @@ from asm_gym.validation import typed
 FORMAT = "asm-gym"
 FORMAT_VERSION = 1
 HEADER = "header.json"
-END = b"PK\x05\x06"  # begins the record at the end of a zip,
-END_BYTES = 22  # which is so long without a comment
+# The end record of a zip: how it begins, and its length in a zip without a comment [bytes].
+END_RECORD = b"PK\x05\x06"
+END_RECORD_BYTES = 22
 
-# Largest content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1.
+# Most bytes of content for each byte of a compressed ``.npz``; recorded streams have about 1.1.
 MOST_EXPANDED = 30
 
 # Errors that reading a damaged zip may raise.
@@ -58,7 +59,7 @@ class Checkpoint(NamedTuple):
     arrays: dict[str, NDArray[Any]]
 
     def array(self, name: str, *shape: int) -> NDArray[Any]:
-        """Return an array. Raises DamagedFile unless it is there, of finite numbers and of that shape."""
+        """Return an array of floats. Raises DamagedFile unless it is there, finite and of that shape."""
         array = self.arrays.get(name)
         if array is None:
             raise DamagedFile("the checkpoint", f"it has no array {name} of shape {shape}")
@@ -112,8 +113,8 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
     with _opened(path) as file:
         members = sorted(set(file.namelist()) - {HEADER})
-        arrays = {name.removesuffix(".npy"): _read(file, name) for name in members}
-        declared = header.pop("arrays", None)  # the shipped agents declare none
+        arrays = {name.removesuffix(".npy"): _read_array(file, name) for name in members}
+        declared = header.pop("arrays", None)  # None in files of the shipped agents
         if declared is not None:
             _check_declared(arrays, declared)
     return Checkpoint(header, arrays)
@@ -122,7 +123,9 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
 def read_header(path: str | Path) -> dict[str, Any]:
     """Return the JSON values of a checkpoint. Raises FileNotFoundError or DamagedFile."""
     with _opened(path) as file:
-        header = json.loads(file.read(HEADER), parse_constant=_finite, parse_float=_finite)
+        header = json.loads(
+            file.read(HEADER), parse_constant=_finite_number, parse_float=_finite_number
+        )
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError("it has no header of asm-gym")
     return header
@@ -133,7 +136,8 @@ def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an ``.npz``, by name. Raises FileNotFoundError or DamagedFile."""
     with _opened(path, "is damaged", MOST_EXPANDED) as file:
         return {
-            name.removesuffix(".npy"): _read(file, name, kinds="biufU") for name in file.namelist()
+            name.removesuffix(".npy"): _read_array(file, name, kinds="biufU")
+            for name in file.namelist()
         }
 
 
@@ -155,19 +159,19 @@ def _check_declared(arrays: Mapping[str, NDArray[Any]], declared: Mapping[str, A
 def _opened(
     path: str | Path,
     verdict: str = "is damaged or not a checkpoint of asm-gym",
-    expanded: int = 1,
+    most_expanded: int = 1,
 ) -> Iterator[zipfile.ZipFile]:
-    """Open a zip whose members are checked before anything is read; its errors become one line that names it.
+    """Open a zip whose members are checked before anything is read; its errors become a DamagedFile.
 
     Args:
         path: of the file.
         verdict: what the message says of a file that cannot be read.
-        expanded: most sizes of the file that its content may have; at 1 nothing may be compressed.
+        most_expanded: most bytes of content for each byte of the file; at 1 no member may be compressed.
     """
     try:
         size = regular_file(path)
         with zipfile.ZipFile(path) as file:
-            _check_members(file.infolist(), size, expanded)
+            _check_members(file.infolist(), size, most_expanded)
             _check_end(Path(path))
             yield file
     except FileNotFoundError:
@@ -179,31 +183,32 @@ def _opened(
 def _check_end(path: Path) -> None:
     """Raise ValueError if bytes follow the end of a zip without a comment, as ours are."""
     with path.open("rb") as file:
-        file.seek(-END_BYTES, os.SEEK_END)
-        if file.read(len(END)) != END:
+        file.seek(-END_RECORD_BYTES, os.SEEK_END)
+        if file.read(len(END_RECORD)) != END_RECORD:
             raise ValueError("other bytes follow its end")
 
 
-def _check_members(members: list[zipfile.ZipInfo], size: int, expanded: int) -> None:
+def _check_members(members: list[zipfile.ZipInfo], size: int, most_expanded: int) -> None:
     """Raise ValueError for members of a zip that must not be read; see ``_opened``."""
     if len({member.filename for member in members}) < len(members):
         raise ValueError("two of its members have the same name")
-    if expanded == 1 and any(member.compress_type != zipfile.ZIP_STORED for member in members):
+    is_compressed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
+    if is_compressed and most_expanded == 1:
         raise ValueError("its members are compressed, and those of asm-gym never are")
     claimed = sum(member.file_size for member in members)
-    if claimed > expanded * size:
+    if claimed > most_expanded * size:
         raise ValueError(f"its members claim {claimed} bytes, in a file of {size}")
 
 
-def _finite(text: str) -> float:
-    """Read a number of JSON; 1e999 would pass for infinity."""
+def _finite_number(text: str) -> float:
+    """Return a number of JSON; raise ValueError for NaN and infinity, also written as 1e999."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"its header holds {text}, which is no number")
     return number
 
 
-def _read(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]:
+def _read_array(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]:
     """Read an array of numbers, in its own memory order, on which the rounding of products depends."""
     array: NDArray[Any] = _npy.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
     if array.dtype.kind not in kinds or not array.dtype.isnative:

@@ -32,7 +32,7 @@ Rows = NDArray[np.floating[Any]]
 SLOW = 0.3  # a channel is slow where a step's change is under this share of its spread
 LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
 FEWEST_VALUES = 5  # a channel of fewer different values is a flag or a mode
-MOST_SHOWN = 10_000  # rows from which the resolution of channels is estimated
+RESOLUTION_ROWS = 10_000  # about so many rows tell the resolution of each channel
 
 # Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted
 # from such a number.
@@ -77,10 +77,10 @@ class StreamScaler:
         """Learn the scale from training episodes (T, D) of more than ``lag`` rows each."""
         rows = np.concatenate(streams).astype(np.float64)  # (N, D)
         parts = [stream[lag:].astype(np.float64) - stream[:-lag] for stream in streams]
-        steps = np.concatenate(parts)  # (M, D)
+        changes = np.concatenate(parts)  # (M, D)
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
-        change = np.maximum(steps.std(axis=0), _least_change(streams, spec.noise))
+        change = np.maximum(changes.std(axis=0), _least_change(streams, spec.noise))
         change = np.where(change > 0, change, spread)
         return cls(spec, mean, spread, change, lag)
 
@@ -103,7 +103,7 @@ class StreamScaler:
 
     @cached_property
     def row_scale(self) -> RowScale:
-        """The same as writable arrays of the one type that compiled code takes."""
+        """The scale for compiled code, which takes writable arrays of one type only."""
         return RowScale(
             mean=np.array(self.mean, np.float64),
             spread=np.array(self.spread, np.float64),
@@ -115,12 +115,12 @@ class StreamScaler:
 
     @cached_property
     def size(self) -> int:
-        """S."""
+        """S, how many numbers are sensed: the values, and the changes of slow channels."""
         return len(self.spec.sensory) + len(self.slow)
 
     @cached_property
     def changes(self) -> slice:
-        """Where the X changes stand among the inputs."""
+        """Columns of the X changes among the I inputs."""
         return slice(self.spec.size, self.spec.size + len(self.spec.sensory))
 
     @cached_property
@@ -129,20 +129,20 @@ class StreamScaler:
         names = [channel.group for channel in self.spec.channels for _ in channel.labels]
         sensory_names = np.array(names)[self.spec.sensory]
         _, groups = np.unique(sensory_names, return_inverse=True)
-        if not groups.any():
+        if not groups.any():  # one group, of number 0
             return np.arange(len(groups))
         return groups.astype(np.intp)
 
     @cached_property
     def inputs(self) -> int:
-        """I."""
+        """I, how many numbers association reads: those before, all changes, the command and a constant."""
         return self.spec.size + self.size + len(self.spec.motor) + 1
 
     def read_episode(self, stream: Rows) -> ScaledRows:
         """Read all rows of an episode (T, D); nothing has moved before the first ``lag``."""
         lag = self.lag
-        before = np.concatenate([stream[:lag], stream[:-lag]])
-        earlier = np.concatenate([before[:lag], before[:-lag]])
+        before = np.concatenate([stream[:lag], stream[:-lag]])  # (T, D), ``lag`` rows before
+        earlier = np.concatenate([before[:lag], before[:-lag]])  # (T, D), 2 ``lag`` rows before
         return self.read(stream, before, earlier)
 
     def read(self, rows: Rows, before: Rows, earlier: Rows) -> ScaledRows:
@@ -156,16 +156,16 @@ class StreamScaler:
 
 
 @inner
-def _bounded(number: float) -> float:
-    """Cut off at ``FARTHEST_NUMBER``; a difference of two infinite numbers is 0."""
+def _cut_off(number: float) -> float:
+    """Return the number cut off at ±``FARTHEST_NUMBER``; 0 for NaN, as two infinite numbers make."""
     if np.isnan(number):
         return 0.0
     return min(max(number, -FARTHEST_NUMBER), FARTHEST_NUMBER)
 
 
 @inner
-def _believed(number: float) -> float:
-    """Return 0 where the number is unknown, or would be cut off."""
+def _zero_if_extreme(number: float) -> float:
+    """Return the number; 0 where it is not known, or so large that it would be cut off."""
     if abs(number) < FARTHEST_NUMBER:
         return number
     return 0.0
@@ -175,7 +175,7 @@ def _believed(number: float) -> float:
 def _standardised(number: float, mean: float, spread: float) -> float:
     """Return a number in standard deviations from the mean; 0 where it is unseen."""
     if np.isfinite(number):
-        return _bounded((number - mean) / spread)
+        return _cut_off((number - mean) / spread)
     return 0.0
 
 
@@ -183,7 +183,7 @@ def _standardised(number: float, mean: float, spread: float) -> float:
 def _changed(number: float, before: float, change: float) -> float:
     """Return a change in standard deviations; 0 where either number is unseen."""
     if np.isfinite(number) and np.isfinite(before):
-        return _bounded((number - before) / change)
+        return _cut_off((number - before) / change)
     return 0.0
 
 
@@ -210,7 +210,7 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
             was_finite = np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])
             if not (finite[n, i] and was_finite):
                 whole[n, 0] = 0.0
-            inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
+            inputs[n, i] = _zero_if_extreme((before[n, i] - mean[i]) / spread[i])
 
         for j in range(X):
             i = scale.sensory[j]
@@ -219,7 +219,7 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
             seen[n, j] = finite[n, i]
             senses[n, j] = _standardised(value, mean[i], spread[i])
             changes[n, j] = _changed(value, last, change[i])
-            inputs[n, D + j] = _believed((value - last) / change[i])
+            inputs[n, D + j] = _zero_if_extreme((value - last) / change[i])
 
         for j in range(L):
             i = scale.slow[j]
@@ -228,17 +228,17 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
             last = before[n, i]
             seen[n, k] = finite[n, i] and np.isfinite(last)
             senses[n, k] = _changed(value, last, change[i])
-            inputs[n, D + k] = _believed((last - earlier[n, i]) / change[i])
+            inputs[n, D + k] = _zero_if_extreme((last - earlier[n, i]) / change[i])
 
         for j in range(A):
             i = scale.motor[j]
             commands[n, j] = _standardised(rows[n, i], mean[i], spread[i])
-            inputs[n, D + X + L + j] = _believed(commands[n, j])
+            inputs[n, D + X + L + j] = _zero_if_extreme(commands[n, j])
     return ScaledRows(senses, seen, commands, inputs, changes, whole, finite)
 
 
 def rows_apart(dt: float) -> int:
-    """Return l for rows that come every ``dt`` seconds."""
+    """Return the lag l of a change, where rows come every ``dt`` seconds."""
     return max(1, round(LAPSE / dt))
 
 
@@ -257,18 +257,18 @@ def _least_change(
 ) -> NDArray[np.float64]:
     """Return the least spread of changes (D,): √2 of half the noise, and of the spread of rounding.
 
-    Otherwise a channel that moves by one of its steps in a thousand rows would surprise at each step.
+    Otherwise a channel that moves once in a thousand rows, by its resolution, would surprise each time.
     """
-    episodes = max(1, MOST_SHOWN // max(1, len(streams[0])))
-    steps = [_resolutions(stream[:MOST_SHOWN]) for stream in streams[:episodes]]
-    rounding = np.max(steps, axis=0) / np.sqrt(12.0)
+    episodes = max(1, RESOLUTION_ROWS // max(1, len(streams[0])))
+    resolutions = [_resolutions(stream[:RESOLUTION_ROWS]) for stream in streams[:episodes]]
+    rounding = np.max(resolutions, axis=0) / np.sqrt(12.0)  # spread of a uniform rounding error
     return np.sqrt(2.0) * np.maximum(noise / 2, rounding)
 
 
 def _resolutions(stream: NDArray[np.float32]) -> list[float]:
     """Return the resolution of each channel (D,) of a stream (T, D); 0 for a flag or a mode."""
-    steps = [0.0] * stream.shape[1]
+    resolutions = [0.0] * stream.shape[1]
     for column, values in enumerate(stream.T):
         if len(np.unique(values)) >= FEWEST_VALUES:
-            steps[column] = resolution(values)
-    return steps
+            resolutions[column] = resolution(values)
+    return resolutions

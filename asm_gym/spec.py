@@ -1,4 +1,4 @@
-"""The sensorimotor stream, one row per control step: ``x_t = [sensed_t, commanded_t]``.
+"""The sensorimotor stream: ``x_t = [sensed_t, commanded_t]``, one row a control step, or several.
 
 The sensors are read after the control step in which the action was commanded (the efference copy).
 """
@@ -94,7 +94,7 @@ class StreamSpec:
 
     Args:
         channels: in their order in a row.
-        dt: control period [s].
+        dt: time between two rows [s]: the control period, or a fraction of it.
         source: name of the robot, for example ``Panda``; not compared between specs.
 
     Example:
@@ -150,30 +150,30 @@ class StreamSpec:
     @property
     def units(self) -> tuple[str, ...]:
         """D units, one for each of ``labels``."""
-        return tuple(self._of_numbers("unit"))
+        return tuple(self._of_each_number("unit"))
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:
         """(D,) standard deviation of the sensor noise [unit of each channel]."""
-        return np.array(self._of_numbers("noise"), np.float64)
+        return np.array(self._of_each_number("noise"), np.float64)
 
     @cached_property
     def resolution(self) -> NDArray[np.float64]:
         """(D,) smallest difference of two readings [unit of each channel]; 0 where unknown."""
-        return np.array(self._of_numbers("resolution"), np.float64)
+        return np.array(self._of_each_number("resolution"), np.float64)
 
     @cached_property
     def motor(self) -> NDArray[np.intp]:
         """Indices of the commanded action."""
-        return np.flatnonzero([group == MOTOR for group in self._of_numbers("group")])
+        return np.flatnonzero([group == MOTOR for group in self._of_each_number("group")])
 
     @cached_property
     def sensory(self) -> NDArray[np.intp]:
         """Indices of everything that is sensed."""
-        return np.flatnonzero([group != MOTOR for group in self._of_numbers("group")])
+        return np.flatnonzero([group != MOTOR for group in self._of_each_number("group")])
 
-    def _of_numbers(self, attribute: str) -> list[Any]:
-        """Return an attribute of the channel of each of the D numbers."""
+    def _of_each_number(self, attribute: str) -> list[Any]:
+        """Return D values: an attribute of the channel that each number belongs to."""
         return [getattr(channel, attribute) for channel in self.channels for _ in channel.labels]
 
     def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
@@ -188,14 +188,14 @@ class StreamSpec:
     def difference(self, other: StreamSpec) -> list[str]:
         """Return one line for each reason why a memory of this spec cannot read streams of ``other``."""
         own_channels = {channel.name: channel for channel in self.channels}
-        others = {channel.name: channel for channel in other.channels}
-        lines = [f"{name}: missing" for name in own_channels if name not in others]
-        lines += [f"{name}: new" for name in others if name not in own_channels]
+        other_channels = {channel.name: channel for channel in other.channels}
+        lines = [f"{name}: missing" for name in own_channels if name not in other_channels]
+        lines += [f"{name}: new" for name in other_channels if name not in own_channels]
         for name, own in own_channels.items():
-            if name in others:
-                lines += _difference(own, others[name])
-        if not lines and list(own_channels) != list(others):
-            lines.append(f"order: {', '.join(own_channels)} against {', '.join(others)}")
+            if name in other_channels:
+                lines += _channel_difference(own, other_channels[name])
+        if not lines and list(own_channels) != list(other_channels):
+            lines.append(f"order: {', '.join(own_channels)} against {', '.join(other_channels)}")
         if abs(self.dt - other.dt) > 1e-9:
             lines.append(f"dt: {self.dt} s against {other.dt} s")
         return lines
@@ -215,7 +215,7 @@ class StreamSpec:
         """Read what ``to_json`` wrote. Raises DamagedFile where it is something else."""
         try:
             raw = json.loads(text)
-            channels = tuple(_channel_of(saved) for saved in raw["channels"])
+            channels = tuple(_channel_from_json(saved) for saved in raw["channels"])
             return cls(channels, raw["dt"], raw["source"])
         except (ValueError, TypeError, KeyError) as error:
             reason = f"{error}, in {short_repr(text)}"
@@ -239,10 +239,10 @@ class StreamSpec:
                     f"the {name} space must be numbers to be read as a stream, got {space}"
                 )
         motor = Channel("action", spaces.flatdim(action), group=MOTOR)
-        return cls((*_channels("observation", observation), motor), dt, "spaces")
+        return cls((*_channels_of_space(observation), motor), dt, "spaces")
 
 
-def _difference(own: Channel, other: Channel) -> list[str]:
+def _channel_difference(own: Channel, other: Channel) -> list[str]:
     """Return the first way in which a channel differs from one of the same name, as a line or none."""
     for attribute in ("size", "unit", "group"):
         expected = getattr(own, attribute)
@@ -252,25 +252,22 @@ def _difference(own: Channel, other: Channel) -> list[str]:
     return []
 
 
-def _channel_of(saved: dict[str, Any]) -> Channel:
+def _channel_from_json(saved: dict[str, Any]) -> Channel:
     """Return the channel that JSON holds."""
     elements = tuple(saved["elements"])
     stops = tuple(map(tuple, saved.get("stops", ())))
     return Channel(**saved | {"elements": elements, "stops": stops})
 
 
-def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
+def _channels_of_space(space: spaces.Space[Any], keys: tuple[str, ...] = ()) -> list[Channel]:
     """Return a channel for each key of a dict, in Gymnasium's order of flattening; one of anything else."""
     if isinstance(space, spaces.Dict):
-        prefix = f"{name}."
-        if name == "observation":
-            prefix = ""
-        parts = [_channels(f"{prefix}{key}", part) for key, part in space.items()]
+        parts = [_channels_of_space(part, (*keys, str(key))) for key, part in space.items()]
         return list(chain.from_iterable(parts))
     size = spaces.flatdim(space)
     if not size:
         return []
-    return [Channel(name, size)]
+    return [Channel(".".join(keys) or "observation", size)]
 
 
 def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:

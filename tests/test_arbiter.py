@@ -31,7 +31,12 @@ def reachable(situation):
     """What ``Arbiter`` never says together: control is handed back only where nothing presses."""
     return not (
         situation.presses
-        and (situation.calm or situation.free or situation.waited or situation.goes_on)
+        and (
+            situation.surprise_low
+            or situation.contact_gone
+            or situation.trial_due
+            or situation.goes_on
+        )
     )
 
 

@@ -165,7 +165,7 @@ def test_a_file_without_a_threshold_leaves_none_of_another_calibration(kalman, t
     calibrated.restore(read_checkpoint(tmp_path / "other.asm", "kalman"))
     assert calibrated.threshold_ is None
     assert calibrated.maxima_ is None
-    assert calibrated.with_threshold(3.0).with_learned(kalman.learned_).threshold_ is None
+    assert calibrated.with_threshold(3.0).restore_learned(kalman.learned_).threshold_ is None
 
 
 def test_scores_of_the_literature_are_what_they_say():

@@ -226,8 +226,9 @@ def test_of_guards_around_one_environment_the_strictest_limits_count_and_an_oute
     outer.reset(seed=0)
     felt = robot.felt_channels
     assert robot.contact_limits.hand_speed == 0.05
-    most = np.minimum(*(ContactLimits(*both).most(felt) for both in ((50.0, 40.0), (200.0, 10.0))))
-    np.testing.assert_array_equal(robot.contact_limits.most(felt), most)
+    both = ContactLimits(50.0, 40.0), ContactLimits(200.0, 10.0)
+    strictest = np.minimum(*(limits.limit_of_each(felt) for limits in both))
+    np.testing.assert_array_equal(robot.contact_limits.limit_of_each(felt), strictest)
     lift.reset(seed=0)
     assert robot.contact_limits is None
 

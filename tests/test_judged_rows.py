@@ -188,7 +188,7 @@ def test_a_row_is_judged_as_the_rules_say():
             assert kept["presses"] == robot.presses
             assert kept["lost"] == lost
             assert kept["event"] == robot.event
-            assert kept["calm_rows"] == robot.calm
+            assert kept["low_surprise_rows"] == robot.calm
             assert kept["policy_rows"] == robot.policy_rows
             assert kept["rows_since_return"] == robot.since
             assert kept["largest_surprise"] == robot.largest

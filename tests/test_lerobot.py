@@ -198,7 +198,7 @@ def test_a_velocity_is_held_by_zero_and_what_no_name_tells_must_be_told(monitor)
         dict(zip(names, other.stream.T.astype(float), strict=True)), rate=RATE, action=["action*"]
     )
     rolls = make_monitor("kalman+evidence", named.spec)
-    rolls = rolls.with_learned(monitor.learned_)
+    rolls = rolls.restore_learned(monitor.learned_)
     rolls.threshold_ = monitor.threshold
     observation = dict(
         zip((m.replace(".pos", ".vel") for m in MOTORS), np.arange(6.0), strict=True)

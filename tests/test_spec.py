@@ -92,6 +92,13 @@ def test_another_rate_is_a_difference_and_another_source_or_noise_is_not():
     assert SPEC.difference(StreamSpec(quiet, 0.05, "another robot")) == []
 
 
+def test_keys_of_nested_spaces_are_all_in_the_name():
+    box = spaces.Box(-1, 1, (2,))
+    nested = spaces.Dict({"observation": spaces.Dict({"q": box}), "q": box})
+    spec = StreamSpec.from_spaces(nested, spaces.Box(-1, 1, (2,)), dt=0.1)
+    assert [channel.name for channel in spec.channels] == ["observation.q", "q", "action"]
+
+
 def test_the_spec_of_plain_spaces_is_observation_then_action():
     box = spaces.Box(-1, 1, (2, 3), np.float32)
     spec = StreamSpec.from_spaces(box, spaces.Box(-1, 1, (2,)), dt=0.1)

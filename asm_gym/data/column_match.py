@@ -45,7 +45,7 @@ class ColumnMatch:
         scales = []
         sentinels = []
         lacking = []
-        for column, place in _with_places(schema.read_columns, by_name):
+        for column, place in _with_places(schema.stream_columns, by_name):
             candidates = (column.name, column.label, place)
             headers = [by_name[name] for name in candidates if name in by_name]
             if not headers:

@@ -16,12 +16,11 @@ from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_column
 from asm_gym.data.table_layout import laid_out
 from asm_gym.exceptions import DamagedFile
 from asm_gym.files import regular_file
-from asm_gym.readings import spans as spans
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
 EPISODE_KIND = "episode"
-CONTROLLER = "controller"  # where an episode, or a monitor, says under which one it was recorded
+CONTROLLER = "controller"  # key of ``info`` for the controller of the arm while it was recorded
 EPISODE_ARRAYS = {
     "stream": "f",
     "actions": "f",
@@ -30,7 +29,7 @@ EPISODE_ARRAYS = {
     "faults": "b",
     "contact_force": "f",
 }
-"""Arrays of a file, and the kinds of numbers that each may have."""
+"""Arrays of an episode file, and the NumPy dtype kinds that each may have."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,8 @@ class EpisodeLabel:
     kind: str = ""  # of the fault; empty without one
     severity: str = ""
     seed: int = 0  # of the environment and of the policy. Episodes that share it are twins
-    onset: int | None = None  # the first step with the fault or variation
-    # where it shows first, as measured
+    onset: int | None = None  # the first control step with the fault or variation
+    # labels of the stream in which the fault shows first
     affected_channels: frozenset[str] = field(default=frozenset(), compare=False)
 
     @property
@@ -154,7 +153,7 @@ class Episode:
         clock: str = "",
         **fields: Any,
     ) -> list[Episode]:
-        """Make an episode from each log of one robot, with one schema that all logs together tell.
+        """Make an episode from each log of one robot, by one schema that is inferred from all of them.
 
         Args:
             frames: for each log a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
@@ -184,7 +183,7 @@ class Episode:
 
     @classmethod
     def read(cls, table: Any, schema: LogSchema, **fields: Any) -> Episode:
-        """Make an episode from a log by its schema, which it keeps.
+        """Make an episode from a log by its schema, which the episode keeps in its ``info``.
 
         Raises:
             ValueError: the log does not fit the schema.
@@ -193,12 +192,12 @@ class Episode:
         info: dict[str, Any] = {LOG_ORIGIN: recorded.origin}
         if schema.memory_spec is None:
             info[LOG_SCHEMA] = schema.to_json()
-        made: dict[str, Any] = {"faults": recorded.faults, "info": info} | fields
-        return cls(recorded.stream, recorded.spec, **made)
+        from_log: dict[str, Any] = {"faults": recorded.faults, "info": info}
+        return cls(recorded.stream, recorded.spec, **from_log | fields)
 
 
-def check_recorded(episode: Episode) -> None:
-    """Raise ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
+def check_lengths(episode: Episode) -> None:
+    """Raise ValueError unless an episode's arrays have matching lengths, and its rewards are finite."""
     rows = len(episode)
     steps = len(episode.actions)
     lengths = {"observations": steps + 1, "rewards": steps, "contact_force": steps}
@@ -223,7 +222,7 @@ def check_recorded(episode: Episode) -> None:
 @typed
 def save_episode(path: str | Path, episode: Episode) -> Path:
     """Write one episode to a file of its own, which appears only when it is complete; return its path."""
-    check_recorded(episode)
+    check_lengths(episode)
     label = None
     if episode.label is not None:
         label = asdict(episode.label)
@@ -248,9 +247,9 @@ def load_episode(path: str | Path) -> Episode:
     try:
         saved = read_checkpoint(Path(path), EPISODE_KIND)
         header = saved.header
-        for name, kinds in EPISODE_ARRAYS.items():
+        for name, dtype_kinds in EPISODE_ARRAYS.items():
             array = saved.arrays.get(name)
-            if array is not None and array.dtype.kind not in kinds:
+            if array is not None and array.dtype.kind not in dtype_kinds:
                 raise ValueError(f"{name} cannot be of {array.dtype}")
         label = header["label"]
         if label is not None:
@@ -265,7 +264,7 @@ def load_episode(path: str | Path) -> Episode:
             info=header["info"],
             **arrays,
         )
-        check_recorded(episode)
+        check_lengths(episode)
         return episode
     except FileNotFoundError:
         raise

@@ -18,7 +18,7 @@ import numpy as np
 from asm_gym.data.array_files import read_parquet
 from asm_gym.data.table_layout import Columns, as_array
 
-INFO = Path("meta") / "info.json"
+INFO_FILE = Path("meta") / "info.json"
 
 # Features that are read begin so; pictures are left out.
 SENSED_PREFIX = "observation."
@@ -40,7 +40,7 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
         if missing:
             names = ", ".join(sorted(missing))
             raise ValueError(
-                f"{file} lacks {names}, which {INFO} declares",
+                f"{file} lacks {names}, which {INFO_FILE} declares",
             )
         for _, episode in frames.groupby("episode_index", sort=False):
             columns: Columns = {}
@@ -58,7 +58,7 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
 
 def _features(folder: Path) -> tuple[float, dict[str, list[str]]]:
     """The rate [Hz], and the names of the numbers of each feature that is read, from the description of a dataset."""
-    path = folder / INFO
+    path = folder / INFO_FILE
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
         version = str(info["codebase_version"])

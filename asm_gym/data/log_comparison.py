@@ -98,8 +98,8 @@ def _refuse_other_scales(episodes: Sequence[Episode], names: Sequence[str]) -> N
 def _other_scales(episodes: Sequence[Episode], schema: LogSchema) -> list[_OtherScale]:
     """Return the channels without a unit of which some logs have another scale."""
     unlike = []
-    compared = {column.stream_channel for column in schema.read_columns if column.varies}
-    for column in schema.read_columns:
+    compared = {column.stream_channel for column in schema.stream_columns if column.varies}
+    for column in schema.stream_columns:
         channel = column.stream_channel
         if channel in compared or column.unit or column.wrap:
             continue

@@ -14,12 +14,12 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
-from asm_gym.checkpoint import read_arrays
+from asm_gym.checkpoint import HEADER, read_arrays
 from asm_gym.data.array_files import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
 from asm_gym.data.column_names import is_label, split_unit
 from asm_gym.data.episode import Episode, load_episode
-from asm_gym.data.lerobot_datasets import INFO, read_lerobot
+from asm_gym.data.lerobot_datasets import INFO_FILE, read_lerobot
 from asm_gym.data.minari_datasets import METADATA_FILE, read_dataset
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.schema import LogSchema
@@ -43,9 +43,10 @@ FILES: dict[str, Callable[[Path, Names], Columns]] = {
 
 HDF5 = (".hdf5", ".h5")  # files of several demonstrations, as robomimic writes them
 NOT_IN_FOLDERS = (".txt", ".dat", ".data", ".log")  # most are no logs: read if they are named
-POINTER = b"version https://git-lfs.github.com"
-FIRST_TABLES = 20  # how many tables of a folder tell what its columns are,
-FIRST_NUMBERS = 20_000_000  # or how many numbers of these
+LFS_POINTER = b"version https://git-lfs.github.com"
+# The schema of a folder is inferred from its first tables: no more of them than either limit.
+FIRST_TABLES = 20
+FIRST_NUMBERS = 20_000_000
 
 
 class Log(NamedTuple):
@@ -64,8 +65,8 @@ class Source:
         columns: a column a sense, a row a moment.
         episode: of our own.
         stated_rate: rows a second that its file states [Hz].
-        success: the task was solved; who hands over a log means that.
-        file: it was read from.
+        success: the task was solved; True where the log does not say.
+        file: path of the file; empty where errors need not name it.
     """
 
     name: str
@@ -139,29 +140,31 @@ def inferred_schema(
     sources: Iterator[Source], hints: SchemaHints
 ) -> tuple[Iterator[Source], LogSchema | None]:
     """Return the sources, and the schema of the first of them; None if these are episodes of ours."""
-    sources, first = first_sources(sources)
-    if not first:
+    sources, first_tables = first_sources(sources)
+    if not first_tables:
         return sources, None
-    hints = replace(hints, stated_rate=first[0].stated_rate)
+    first = first_tables[0]
+    hints = replace(hints, stated_rate=first.stated_rate)
     try:
-        schema = infer_schema([source.columns for source in first], hints)
+        schema = infer_schema([source.columns for source in first_tables], hints)
         schema.check()
     except ValueError as error:
-        raise ValueError(f"{first[0].file or first[0].name}: {error}") from error
+        raise ValueError(f"{first.file or first.name}: {error}") from error
     note_columns(schema)
     return sources, schema
 
 
 def first_sources(sources: Iterator[Source]) -> tuple[Iterator[Source], list[Source]]:
-    """Return the sources, and the first tables of them, which tell what columns are."""
-    first: list[Source] = []
+    """Return all sources again, and the first tables of them, from which a schema is inferred."""
+    taken: list[Source] = []
     numbers = 0
     for source in islice(sources, FIRST_TABLES):
-        first.append(source)
+        taken.append(source)
         numbers += sum(values.size for values in source.columns.values())
         if numbers > FIRST_NUMBERS or source.episode is not None:
             break
-    return chain(first, sources), [source for source in first if source.columns]
+    tables = [source for source in taken if source.columns]
+    return chain(taken, sources), tables
 
 
 def read_sources(path: str | Path, hints: SchemaHints) -> Iterator[Source]:
@@ -175,7 +178,7 @@ def read_sources(path: str | Path, hints: SchemaHints) -> Iterator[Source]:
     """
     path = Path(path)
     files = _files_at(path)
-    if (path / INFO).is_file():
+    if (path / INFO_FILE).is_file():
         for number, (columns, rate, success) in enumerate(read_lerobot(path)):
             yield Source(
                 name=f"episode {number}",
@@ -183,20 +186,20 @@ def read_sources(path: str | Path, hints: SchemaHints) -> Iterator[Source]:
                 stated_rate=rate,
                 success=success,
             )
-    elif not files:
-        if next(path.rglob(METADATA_FILE), None) is None:
-            known = ", ".join((*FILES, *HDF5))
-            raise FileNotFoundError(
-                f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset"
-            )
+    elif files:
+        yield from _sources_of_files(files, hints)
+    elif next(path.rglob(METADATA_FILE), None) is not None:
         for number, episode in enumerate(read_dataset(path)):
             yield Source(name=f"episode {number}", episode=episode)
     else:
-        yield from _sources_of_files(files, hints)
+        known = ", ".join((*FILES, *HDF5))
+        raise FileNotFoundError(
+            f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset"
+        )
 
 
 def _sources_of_files(files: dict[str, Path], hints: SchemaHints) -> Iterator[Source]:
-    """Yield the recordings in files by their names."""
+    """Yield the recordings in files, by name; note the unread files, or raise ValueError if all are."""
     damaged = 0
     for name, file in files.items():
         try:
@@ -225,9 +228,9 @@ def _sources_in(name: str, file: Path, hints: SchemaHints) -> Iterator[Source]:
     """Yield the recordings in a file."""
     regular_file(file)
     with file.open("rb") as opened:
-        if opened.read(len(POINTER)) == POINTER:
+        if opened.read(len(LFS_POINTER)) == LFS_POINTER:
             raise ValueError("it is a pointer of Git LFS and not the file itself: run git lfs pull")
-    if file.suffix == ".npz" and "header.json" in zipfile.ZipFile(file).namelist():
+    if file.suffix == ".npz" and _is_own_episode(file):
         yield Source(name=name, episode=load_episode(file))
     elif file.suffix in HDF5:
         for part, (columns, rate) in read_hdf5(file).items():
@@ -242,8 +245,17 @@ def _sources_in(name: str, file: Path, hints: SchemaHints) -> Iterator[Source]:
         yield Source(name=name, columns=laid_out(columns), file=str(file))
 
 
+def _is_own_episode(file: Path) -> bool:
+    """Return whether an ``.npz`` is a checkpoint of ours, and not only arrays."""
+    with zipfile.ZipFile(file) as archive:
+        return HEADER in archive.namelist()
+
+
 def _files_at(path: Path) -> dict[str, Path]:
-    """Return the file, or the files in a folder that can be read and are whole, by their names."""
+    """Return the file, or the readable files of a folder, by their names.
+
+    Hidden files are left out: a file that is being written is hidden until it is whole.
+    """
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
     known = (*FILES, *HDF5)

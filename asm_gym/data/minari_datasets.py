@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from asm_gym.control_period import control_period
 from asm_gym.data.array_files import check_hdf5
-from asm_gym.data.episode import Episode, check_recorded
+from asm_gym.data.episode import Episode, check_lengths
 from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 from asm_gym.spec import StreamSpec, flat_rows
@@ -103,7 +103,7 @@ def _check_complete(episodes: Sequence[Episode]) -> None:
             raise ValueError(
                 f"episode {n} needs an action, a reward and a flat observation of every step"
             )
-        check_recorded(episode)
+        check_lengths(episode)
 
 
 def _folder(root: Path, dataset_id: str) -> Path:
@@ -295,7 +295,7 @@ def _episode(data: Any, note: dict[str, Any], spec: StreamSpec, dataset: Any) ->
         faults=_without_reset(faults, steps),
         info=info,
     )
-    check_recorded(episode)
+    check_lengths(episode)
     return episode
 
 

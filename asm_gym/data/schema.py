@@ -32,15 +32,28 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 LOG_SCHEMA = "log_schema"  # where an episode and a memory keep the schema that they were read with
 LOG_ORIGIN = "origin"  # where an episode keeps the stamp of its first row [s]
-RESAMPLED = 1.5  # a log is read at another rate by its clock, up to so many times its own
+MOST_RESAMPLED = 1.5  # greatest ratio of two rates at which a log is resampled by its clock
 RATE_TOLERANCE = 0.01  # share by which a rate may differ without a note
 NO_RATE = (
     "how many rows come a second? Say the rate [Hz] (--rate), or name or add a column of times "
     "(--clock)"
 )
 TURN_UNITS = {TAU: "rad", 360.0: "deg"}
-"""The unit of an angle by its turn."""
-NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
+"""The unit of an angle, by the size of a full turn in that unit."""
+HEALTHY_LABELS = (
+    "",
+    "0",
+    "false",
+    "no",
+    "none",
+    "normal",
+    "nominal",
+    "ok",
+    "good",
+    "healthy",
+    "nan",
+)
+"""Cells of a column of labels, in lower case, that say that nothing is wrong."""
 
 
 class Recorded(NamedTuple):
@@ -60,8 +73,8 @@ class LogSchema:
         columns: every column, those of the stream in their order in a row.
         rate: rows a second [Hz]; 0 if nothing tells, and then no log can be read.
         clock: tells when a row was sensed; None if rows come at ``rate``.
-        find_clock: name of the clock that is looked for in each log, or "" for any; None to read
-            ``clock``. Not saved.
+        find_clock: None to read every log by ``clock``; else the name of the clock that is looked
+            for in each log, or "" for whichever it has. Not saved.
         memory_spec: the stream of a memory that keeps no schema; it is read by its labels. Not saved.
 
     Example:
@@ -90,7 +103,7 @@ class LogSchema:
     @classmethod
     def of_spec(cls, spec: StreamSpec) -> Self:
         """Return the schema of a stream whose columns are called as its labels are."""
-        columns = chain.from_iterable(map(_columns_of, spec.channels))
+        columns = chain.from_iterable(_columns_of(channel) for channel in spec.channels)
         return cls(tuple(columns), 1.0 / spec.dt, find_clock="", memory_spec=spec)
 
     @classmethod
@@ -106,7 +119,7 @@ class LogSchema:
         return {name for column in self.columns for name in (column.name, column.label)}
 
     @cached_property
-    def read_columns(self) -> list[LogColumn]:
+    def stream_columns(self) -> list[LogColumn]:
         """The columns of a stream's row in their order: commands stand last, or as in the memory."""
         columns = [column for column in self.columns if column.is_read]
         if self.memory_spec is None:
@@ -124,7 +137,7 @@ class LogSchema:
             return self.memory_spec
         self.check()
         channels: dict[str, list[LogColumn]] = {}
-        for column in self.read_columns:
+        for column in self.stream_columns:
             channels.setdefault(column.stream_channel, []).append(column)
         described = [_channel(name, columns) for name, columns in channels.items()]
         return StreamSpec(tuple(described), 1.0 / self.rate, "table")
@@ -134,7 +147,7 @@ class LogSchema:
         for column in self.columns:
             if column.role == UNCLEAR:
                 raise ValueError(f"{column.name} {column.reason}")
-        names = Counter(column.name for column in self.read_columns)
+        names = Counter(column.name for column in self.stream_columns)
         for name, count in names.items():
             if count > 1:
                 raise ValueError(f"columns must have different names, got {name!r} twice")
@@ -161,8 +174,9 @@ class LogSchema:
         table = laid_out(table)
         spec = self.spec
         match = ColumnMatch(self, table)
-        marks = self._marks(table, match.headers)
-        rows = np.column_stack([match.rows(table), *marks])
+        # Marks of faults stand behind the stream's columns, so that they are resampled with them.
+        fault_marks = self._fault_marks(table, match.headers)
+        rows = np.column_stack([match.rows(table), *fault_marks])
         origin = None
         clock = self.clock_in(table)
         if clock is not None:
@@ -172,10 +186,10 @@ class LogSchema:
             origin = timing.times.origin + float(timing.times.seconds[0])
 
         stream = rows[:, : spec.size].astype(np.float32)
-        marked = np.nan_to_num(rows[:, spec.size :])
+        resampled_marks = np.nan_to_num(rows[:, spec.size :])
         faults: NDArray[np.bool_] = np.zeros(0, np.bool_)
-        if marked.size:
-            faults = np.asarray(marked.any(axis=1))
+        if resampled_marks.size:
+            faults = np.asarray(resampled_marks.any(axis=1))
         return Recorded(stream, spec, faults, origin)
 
     def clock_in(self, table: Columns) -> LogClock | None:
@@ -184,43 +198,52 @@ class LogSchema:
         Raises:
             ValueError: it has no clock, and must have one.
         """
-        own = self.clock
-        wanted = self.find_clock
-        if wanted is None and (own is None or own.is_in(table)):
-            return own
-        clock = infer_clock(table, wanted or "", 1.0 / self.rate)
-        if clock is None:
+        if self.find_clock is not None:
+            found = infer_clock(table, self.find_clock, 1.0 / self.rate)
+            if found is None:
+                raise ValueError(NO_RATE)
+            return found
+
+        if self.clock is None or self.clock.is_in(table):
+            return self.clock
+        substitute = infer_clock(table, "", 1.0 / self.rate)
+        if substitute is None:
             raise ValueError(NO_RATE)
-        if wanted is None and own is not None:
-            note(f"the clock {own.name!r} is not there: {clock.name!r} is read")
-        return clock
+        note(f"the clock {self.clock.name!r} is not there: {substitute.name!r} is read")
+        return substitute
 
     def _check_rate(self, timing: Timing) -> None:
         """Raise ValueError if rows come at another rate, and tell the user if they are resampled."""
         if timing.dt is None:
             return
         ratio = timing.dt * self.rate
-        own = 1 / timing.dt
+        log_rate = 1 / timing.dt
         if not can_resample(ratio):
             raise ValueError(
-                f"the memory reads {self.rate:.4g} rows a second, these come at {own:.4g}"
+                f"the memory reads {self.rate:.4g} rows a second, these come at {log_rate:.4g}"
             )
         if abs(ratio - 1) > RATE_TOLERANCE:
             note(
-                f"rows that come at {own:.4g} a second are read at {self.rate:.4g}, by their clock"
+                f"rows that come at {log_rate:.4g} a second are read at {self.rate:.4g}, "
+                "by their clock"
             )
 
-    def _marks(self, table: Columns, read: Sequence[str]) -> Iterator[NDArray[np.bool_]]:
-        """Yield which rows (T,) each label that is not ``read`` as a number marks as faulty."""
+    def _fault_marks(
+        self, table: Columns, stream_headers: Sequence[str]
+    ) -> Iterator[NDArray[np.bool_]]:
+        """Yield the rows (T,) that a column marks as faulty, for each label that is not in the stream."""
         for header, values in table.items():
-            if header not in read and self._is_label(split_unit(header)[0], values):
+            if header not in stream_headers and self._is_label(split_unit(header)[0], values):
                 yield _is_marked(values)
 
     def _is_label(self, name: str, values: NDArray[Any]) -> bool:
-        """Return whether a column labels faults: by the schema, or if that has no such column."""
+        """Return whether a column labels faults: as its role says, or its name if it has none.
+
+        Names in a schema may be patterns; the role of the exact name comes first.
+        """
         exact = [column.role for column in self.columns if column.name == name]
-        matching = [column.role for column in self.columns if fnmatchcase(name, column.name)]
-        roles = exact + matching
+        by_pattern = [column.role for column in self.columns if fnmatchcase(name, column.name)]
+        roles = exact + by_pattern
         if roles:
             return roles[0] == LABEL
         return is_called_label(name, values)
@@ -246,15 +269,15 @@ class LogSchema:
             clock = saved["clock"]
             if clock is None:
                 return schema
-            lists = {key: tuple(clock[key]) for key in ("columns", "units")}
-            return replace(schema, clock=LogClock(**clock | lists))
+            tuples = {key: tuple(clock[key]) for key in ("columns", "units")}  # lists in JSON
+            return replace(schema, clock=LogClock(**clock | tuples))
         except (KeyError, TypeError) as error:
             raise DamagedFile("the schema of the logs", repr(error)) from error
 
 
 def can_resample(ratio: float) -> bool:
-    """Return whether logs of so many times the rate, or the period, of a memory can be read."""
-    return 1 / RESAMPLED <= ratio <= RESAMPLED
+    """Return whether a log can be read at another rate; ``ratio`` is of the two rates, either first."""
+    return 1 / MOST_RESAMPLED <= ratio <= MOST_RESAMPLED
 
 
 def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
@@ -271,7 +294,7 @@ def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
     noise = 0.0
     if group != MOTOR:
         noise = float(np.median([column.noise for column in columns]))
-    if first.wrap:
+    if first.wrap:  # an angle that turns over is read as its sine and cosine
         unit = TURN_UNITS.get(first.wrap, "deg")
         return Channel(name, 2, unit, noise, group, TURNED_ELEMENTS)
 
@@ -324,4 +347,4 @@ def _is_marked(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Return the rows (T,) in which a label says that something is wrong."""
     if is_numeric(values):
         return np.asarray(np.nan_to_num(values.astype(np.float64)) != 0)
-    return np.array([str(cell).strip().lower() not in NORMAL for cell in values])
+    return np.array([str(cell).strip().lower() not in HEALTHY_LABELS for cell in values])

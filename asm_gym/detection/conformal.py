@@ -44,10 +44,9 @@ MOST_PER_HOUR = 1e6
 ROUNDING = 1e-9
 ENOUGH = 5.0  # maxima that may exceed a threshold, from which on they are counted
 FEWEST_IN_TAIL = 50  # maxima that a model of their tail takes
-TAIL_SHARE = 10  # one in so many maxima is in the tail
-# Standard errors added to its index: with these a Pareto law keeps a rate of 1 % from 100 maxima
-# on.
-SURER = 0.6
+MAXIMA_PER_ONE_IN_TAIL = 10  # one in so many maxima is in the tail
+# Added to the exponent of the tail: with these a Pareto law keeps a rate of 1 % from 100 maxima on.
+STANDARD_ERRORS = 0.6
 
 
 def conformal_episodes(rate: float) -> int:
@@ -106,21 +105,22 @@ class Tail(NamedTuple):
         if len(maxima) < FEWEST_IN_TAIL or expected >= ENOUGH:
             return None
         values = np.sort(maxima)
-        size = len(values) // TAIL_SHARE
+        size = len(values) // MAXIMA_PER_ONE_IN_TAIL
         lowest = float(values[-size - 1])
         if not 0.0 < lowest < values[-1] < np.inf:
             return None
         hill = float(np.log(values[-size:] / lowest).mean())
-        surer = 1.0 + SURER / math.sqrt(size)
-        return cls(size=size, lowest=lowest, exponent=hill * surer)
+        margin = 1.0 + STANDARD_ERRORS / math.sqrt(size)
+        return cls(size=size, lowest=lowest, exponent=hill * margin)
 
     def threshold(self, expected: float) -> float:
         """Return what so many are expected to exceed."""
         return self.lowest * (self.size / expected) ** self.exponent
 
-    def expected(self, threshold: float) -> float:
+    def expected_above(self, threshold: float) -> float:
         """Return how many are expected to exceed a threshold above u: half of one at least, where the model ends."""
-        return max(self.size * (threshold / self.lowest) ** (-1.0 / self.exponent), 0.5)
+        expected = self.size * (threshold / self.lowest) ** (-1.0 / self.exponent)
+        return max(expected, 0.5)
 
 
 def episode_threshold(maxima: Array, rate: float) -> float:
@@ -163,10 +163,11 @@ class Promise(NamedTuple):
             at_most = float(betaincinv(beyond + 1, episodes - beyond, CONFIDENCE))
 
         rate = (beyond + 1) / (episodes + 1)
-        tail = Tail.of(maxima, 0.0)
-        modelled = tail is not None and threshold > tail.lowest and threshold not in maxima
+        tail = Tail.of(maxima, expected=0.0)  # whatever the rate was
+        was_counted = threshold in maxima  # a threshold that is counted is one of the maxima
+        modelled = tail is not None and threshold > tail.lowest and not was_counted
         if tail is not None and modelled:
-            rate = tail.expected(threshold) / episodes
+            rate = tail.expected_above(threshold) / episodes
         return cls(
             episodes=episodes,
             rate=rate,
@@ -176,10 +177,10 @@ class Promise(NamedTuple):
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
-        each = 1.0
+        per_hour = 1.0
         if self.per == EPISODE:
-            each = self.episodes / hours
-        return self.rate * each, self.at_most * each
+            per_hour = self.episodes / hours
+        return self.rate * per_hour, self.at_most * per_hour
 
 
 class Blocks(NamedTuple):
@@ -198,23 +199,24 @@ class Blocks(NamedTuple):
     ) -> Blocks:
         """Cut the values (T,) of whole episodes, a row each ``dt`` [s]; ``each`` names the group of every episode."""
         most = rows_of_a_minute(dt)
-        names = list(dict.fromkeys(each)) or [""]
+        group_of_episodes = each or [""] * len(values)
+        groups = list(dict.fromkeys(group_of_episodes))
         blocks = []
-        for value, name in zip(values, each or names * len(values), strict=True):
+        for value, group in zip(values, group_of_episodes, strict=True):
             for first in range(0, len(value), most):
                 block = value[first : first + most]
                 hours = len(block) * dt / 3600
-                blocks.append((block.max(), hours, names.index(name)))
+                blocks.append((block.max(), hours, groups.index(group)))
         columns = np.reshape(np.array(blocks, float), (-1, 3)).T
-        if len(names) < 2:
-            columns = columns[:2]
+        if len(groups) < 2:
+            columns = columns[:2]  # without the group
         return cls(*columns)
 
     @classmethod
     def restored(cls, kept: Floats) -> Blocks:
         """Read an ``array``. Raises ValueError where that is no maxima and hours."""
-        shaped = kept.ndim == 2 and len(kept) in (2, 3) and kept.size
-        if not shaped or not (kept[1] > 0).all():
+        fits = kept.ndim == 2 and len(kept) in (2, 3) and kept.size > 0
+        if not fits or not (kept[1] > 0).all():  # hours
             raise ValueError(
                 f"blocks should be maxima and hours, (2, n) or (3, n), found {short_repr(kept)}"
             )
@@ -272,7 +274,8 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
         return tail.threshold(expected)
     allowed = math.floor(expected + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)
-    return float(maxima[max(len(maxima) - 1 - allowed, 0)])
+    rank = max(len(maxima) - 1 - allowed, 0)
+    return float(maxima[rank])
 
 
 def hourly_promise(
@@ -286,16 +289,16 @@ def hourly_promise(
         worst = max(promises, key=lambda promise: promise.rate)
         return worst._replace(hours=blocks.total)
 
-    each = Promise.of(blocks.maxima, threshold)
+    by_block = Promise.of(blocks.maxima, threshold)
     count = len(blocks.maxima)
     blocks_judged = count + 1  # with a fresh one
-    if each.modelled:
+    if by_block.modelled:
         blocks_judged = count
     return Promise(
         episodes=episodes,
-        rate=each.rate * blocks_judged / blocks.total,
-        at_most=each.at_most * count / blocks.total,
+        rate=by_block.rate * blocks_judged / blocks.total,
+        at_most=by_block.at_most * count / blocks.total,
         per=HOUR,
         hours=blocks.total,
-        modelled=each.modelled,
+        modelled=by_block.modelled,
     )

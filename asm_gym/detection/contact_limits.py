@@ -70,8 +70,8 @@ class ContactLimits:
             check_number("healthy", value, low=0)
         check_flag("stays", self.stays)
 
-    def most(self, felt: Sequence[Channel]) -> Floats:
-        """Return (N,) the limit of each number that is felt.
+    def limit_of_each(self, felt: Sequence[Channel]) -> Floats:
+        """Return (N,) the limit of each number of the channels ``felt``.
 
         Raises ValueError where ``healthy`` is of another arm.
         """
@@ -91,27 +91,19 @@ class ContactLimits:
             )
         return np.maximum(limits, self.healthy)
 
-    def stricter(
-        self,
-        forces: float,
-        speed: float,
-    ) -> ContactLimits:
-        """Return limits with a share of those on ``forces``, and at most ``speed`` [m/s]."""
+    def reduced(self, force_share: float, hand_speed: float) -> ContactLimits:
+        """Return limits with a share of the limits on forces, and a hand speed of at most ``hand_speed`` [m/s]."""
         return replace(
             self,
-            wrist_force=forces * self.wrist_force,
-            external_torque=forces * self.external_torque,
-            hand_speed=min(speed, self.hand_speed),
-            healthy=tuple(forces * value for value in self.healthy),
+            wrist_force=force_share * self.wrist_force,
+            external_torque=force_share * self.external_torque,
+            hand_speed=min(hand_speed, self.hand_speed),
+            healthy=tuple(force_share * value for value in self.healthy),
             pace=None,
         )
 
-    def and_those_of(
-        self,
-        other: ContactLimits,
-        felt: Sequence[Channel],
-    ) -> ContactLimits:
-        """Return limits as strict as the stricter of two; those for which an arm stays count alone, if one does."""
+    def strictest_with(self, other: ContactLimits, felt: Sequence[Channel]) -> ContactLimits:
+        """Return the stricter of two limits, for each number; where only one of the two has ``stays``, that one."""
         if self.stays and not other.stays:
             return self
         if other.stays and not self.stays:
@@ -121,7 +113,7 @@ class ContactLimits:
         if pace is None or other.pace is None or not np.array_equal(pace.cells, other.pace.cells):
             pace = None
         strictest = {name: min(getattr(self, name), getattr(other, name)) for name in STRICTEST}
-        healthy = np.minimum(self.most(felt), other.most(felt))
+        healthy = np.minimum(self.limit_of_each(felt), other.limit_of_each(felt))
         return replace(self, **strictest, healthy=tuple(healthy.tolist()), pace=pace)
 
     def speed_limit(self) -> SpeedLimit:
@@ -154,18 +146,19 @@ def healthy_forces(
     felt = [channel for channel in spec.channels if channel.name.endswith(LIMITED)]
     if not streams or not felt:
         return ()
-    numbers = np.arange(spec.size)
+    all_columns = np.arange(spec.size)
     columns: list[int] = []
     for channel in felt:
-        peak = spec.slices.get(f"{channel.name}_peak", spec.slices[channel.name])
-        columns += numbers[peak].tolist()
+        # the peaks within a row, where the stream has them
+        part = spec.slices.get(f"{channel.name}_peak", spec.slices[channel.name])
+        columns += all_columns[part].tolist()
     largest = [np.nanmax(np.abs(stream[:, columns]), axis=0) for stream in streams]
     reached = np.array(largest, np.float64)  # (episodes, N)
 
-    usual = ContactLimits().most(felt)
-    loads = (reached / usual).max(axis=1)
-    most = loads.max()
+    usual = ContactLimits().limit_of_each(felt)
+    loads = (reached / usual).max(axis=1)  # (episodes,)
+    highest_load = loads.max()
     if len(loads) >= 1.0 / HARDEST_EPISODES:
-        most = np.quantile(loads, 1.0 - HARDEST_EPISODES, method="lower")
-    highest = reached[loads <= most].max(axis=0)
+        highest_load = np.quantile(loads, 1.0 - HARDEST_EPISODES, method="lower")
+    highest = reached[loads <= highest_load].max(axis=0)
     return tuple(np.minimum(highest, HIGHEST_HEALTHY * usual).tolist())

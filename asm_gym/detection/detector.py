@@ -105,7 +105,7 @@ class Detector(NamedTuple):
         rows = sum(len(run.errors) for run in runs)
         if rows < ROWS_PER_NUMBER * (len(self.context_quantile) - 1):
             return self
-        stride = -(-rows // MOST_ROWS)
+        stride = math.ceil(rows / MOST_ROWS)
         contexts = []
         levels = []
         for run in runs:
@@ -121,10 +121,10 @@ class Detector(NamedTuple):
     @property
     def reach(self) -> float:
         """Largest value in a context of 0: every error at ν for ever, so that |w_i| <= ν Σ_j |M_ji|."""
-        most = self.bound * np.abs(self.whitening).sum(axis=0, keepdims=True)
+        largest = self.bound * np.abs(self.whitening).sum(axis=0, keepdims=True)
         usual = self.context_quantile[-1]
         with np.errstate(over="ignore"):  # a context that hides everything reaches 0
-            reach = self._lasting(most)[0] / np.exp(usual)
+            reach = self._lasting(largest)[0] / np.exp(usual)
         return float(reach)
 
     @property
@@ -149,8 +149,8 @@ class Detector(NamedTuple):
     def start(self, batch: int) -> Evidence:
         """Return evidence before the first row."""
         gains, errors = self.ceiling.shape
-        context = (len(self.context_quantile) - 1) // 2
-        return Evidence.start(batch, gains, errors, context)
+        context_size = (len(self.context_quantile) - 1) // 2
+        return Evidence.start(batch, gains, errors, context_size)
 
     def step(self, evidence: Evidence, output: ModelOutput) -> tuple[Evidence, Floats]:
         """Return the evidence after a row of B streams, and each error's share (B, X) of the value."""
@@ -201,8 +201,8 @@ def step_evidence(
 
         usual = usual_level(detector, before.context[n], after.context[n], output.contexts[n])
         value = powers ** (1.0 / POWER) * np.exp(greatest) / np.exp(usual)
-        value /= max(powers, TINY)
-        scale(share, value)
+        value_of_a_power = value / max(powers, TINY)
+        scale(share, value_of_a_power)
 
 
 @inner
@@ -271,7 +271,7 @@ def usual_levels(
     """Return w and b (C + 1,), and l and h (2,), from contexts (T, C) and log s (T,) of nominal episodes."""
     context = np.concatenate(contexts)
     level = np.concatenate(levels)
-    weights = habituate(context, level, rng)[:-1]
+    weights = habituate(context, level, rng)[:-1]  # its bias is set anew, within the limits
     drive = context @ weights
     limits = np.quantile(drive, (EXTREME_SHARE, 1.0 - EXTREME_SHARE))
     limited = np.clip(drive, limits[0], limits[1])

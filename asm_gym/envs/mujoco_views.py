@@ -109,7 +109,7 @@ GOAL = np.dtype(
         ("orientation", np.float64, (3, 3)),
         ("joints", np.float64, JOINTS),  # [rad]
         ("anchor", np.float64, JOINTS),  # where an arm that is held is to stay [rad]
-        ("held", np.int64),  # 0, ``control.HELD``, ``control.BRAKING`` or ``control.YIELDING``
+        ("held", np.int64),  # 0, or HELD, BRAKING, YIELDING of ``controllers``
     ]
 )
 """The set-point of one arm's controller, changed in place."""

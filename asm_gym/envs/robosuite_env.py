@@ -160,8 +160,8 @@ class RobosuiteEnv(SteppedEnv):
         self._renderer = OffscreenRenderer(camera, width, height)
 
     def _build_actions(self) -> None:
-        parts = self.simulation.parts
-        self.hand_chains = chains_of(parts, self.simulation.model, self.sensor_noise)
+        arms = self.simulation.parts
+        self.hand_chains = chains_of(arms, self.simulation.model, self.sensor_noise)
         """Kinematic chains of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
         self._actions.begin_episode(self.simulation)
@@ -199,10 +199,10 @@ class RobosuiteEnv(SteppedEnv):
     @property
     def usual_contact_limits(self) -> ContactLimits:
         """The strictest contact limits of the arms, by ``asm_gym.envs.robots``."""
-        first, *others = (robot_named(name).contact_limits for name in self.robots)
+        strictest, *others = (robot_named(name).contact_limits for name in self.robots)
         for limits in others:
-            first = first.and_those_of(limits, self.felt_channels)
-        return first
+            strictest = strictest.strictest_with(limits, self.felt_channels)
+        return strictest
 
     @property
     def stream_freq(self) -> int:
@@ -231,13 +231,10 @@ class RobosuiteEnv(SteppedEnv):
             robosuite_backend.reseed(env, self.np_random)
             self._seeded = True
         robosuite_backend.choose_object(env, self.task)
-        draws = seed is not None and self.task.draws_shapes
-        # What others edit would be mixed up with what is drawn.
-        nominal = self.simulation.nominal
-        edited = len(self.edits) > 0 or nominal.now() is not nominal.unedited
-        env.hard_reset = draws and (edited or not lift_cube.draw(env))
+        draws_shapes = seed is not None and self.task.draws_shapes
+        env.hard_reset = draws_shapes and not self._draw_in_place()
         env.reset()
-        if draws:
+        if draws_shapes:
             self._bind()
         else:
             self.simulation.begin_episode()
@@ -252,6 +249,14 @@ class RobosuiteEnv(SteppedEnv):
         self._ended = False
         self._solved = False
         return self._senses.observation(self._reading), self._info(bool(env._check_success()))
+
+    def _draw_in_place(self) -> bool:
+        """Draw the shapes of the loaded model anew; return False where the model must be loaded anew for that."""
+        nominal = self.simulation.nominal
+        is_edited = len(self.edits) > 0 or nominal.now() is not nominal.unedited
+        if is_edited:  # the edits would be mixed up with what is drawn
+            return False
+        return lift_cube.draw(self.robosuite_env)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Run one control step by an action (A,), which is clipped to [-1, 1].
@@ -289,6 +294,7 @@ class RobosuiteEnv(SteppedEnv):
         return self._senses.observation(self._reading), reward, terminated, truncated, info
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
+        """Return ``info`` after a step or a reset."""
         self._solved |= success
         info: dict[str, Any] = {}
         if self._senses.stream_spec is not None:

@@ -48,16 +48,16 @@ class Simulation:
         self.warnings: Any = self.data.warning.number  # a view
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
-        robots = [bodies(self.model, robot) for robot, _ in self.parts]
-        own_bodies = np.unique(np.concatenate(robots))
+        bodies_of_robots = [bodies(self.model, robot) for robot, _ in self.parts]
+        own_bodies = np.unique(np.concatenate(bodies_of_robots))
         # the robots' own model of their dynamics
         self.nominal = NominalDynamics(self.model, self.views, own_bodies)
-        n = len(self.parts)
-        self._samples = np.zeros((n, substeps, kernels.SAMPLE))
-        self.speed_limits = np.full(n, np.inf)
+        arm_count = len(self.parts)
+        self._samples = np.zeros((arm_count, substeps, kernels.SAMPLE))
+        self.speed_limits = np.full(arm_count, np.inf)
         """(A,) speed of the fastest point of an arm, from which on it is slowed down [m/s]."""
         self._limits = SubstepLimits(
-            load_limits=np.full((n, FELT), np.inf),
+            load_limits=np.full((arm_count, FELT), np.inf),
             load_share=np.zeros(1),
             status=records(1, STATUS),
             speed_limits=self.speed_limits,
@@ -72,18 +72,18 @@ class Simulation:
 
     def begin_episode(self) -> None:
         """Take up the controllers, which robosuite makes anew in every reset."""
-        self._done = 0
-        self._row_began = 0
-        self._force_before = 0.0
-        self._pressed = False
-        self._fresh = False
+        self._substeps_done = 0  # of the control step
+        self._row_start = 0  # substep of the control step at which the row begins
+        self._force_of_earlier_rows = 0.0  # the largest in this control step [N]
+        self._pressed = False  # a contact limit was passed in the control step before
+        self._has_new_command = False  # that the controllers have not taken up
         self._samples[:] = 0.0
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
         self._work = Work.empty()
         self._bound_nominal: NominalViews | None = None  # that ``_bound`` holds
         self._take_up_controllers()
-        self._forget_limits()
+        self._clear_limits()
 
         if must_compile(kernels.run):
             print(
@@ -95,6 +95,7 @@ class Simulation:
         self._summarise(1)
 
     def _take_up_controllers(self) -> None:
+        """Describe the controllers, and each arm's part of the action."""
         # whether control runs compiled
         self.compiled = all(is_compilable(part) for part in self.parts)
         self.arms = describe(self.parts, self.model)
@@ -102,7 +103,7 @@ class Simulation:
         self.controllers = [controller_of(part) for part in self.parts]
         """Robosuite's, of each arm."""
         self.moves: list[slice] = []
-        """Each arm's part of the action, asked for once an episode: robosuite makes it anew at every look."""
+        """Each arm's part of the action; robosuite computes it anew whenever it is read."""
         self._grippers: list[Gripper] = []
         start = 0
         for a, (robot, arm) in enumerate(self.parts):
@@ -110,35 +111,40 @@ class Simulation:
             move = slice(start + low, start + high)
             self.moves.append(move)
             describe_inputs(self.arms[a], self.model, self.controllers[a], move)
-            low, high = robot._action_split_indexes.get(robot.get_gripper_name(arm), (0, 0))
+
+            no_gripper = 0, 0
+            gripper_name = robot.get_gripper_name(arm)
+            low, high = robot._action_split_indexes.get(gripper_name, no_gripper)
             if low < high:
-                part = slice(start + low, start + high)
-                self._grippers.append(Gripper(robot, arm, part, self.views))
+                grip = slice(start + low, start + high)
+                self._grippers.append(Gripper(robot, arm, grip, self.views))
             start += robot.action_dim
         self._action = np.zeros(start)  # in robosuite's units
 
-    def _forget_limits(self) -> None:
+    def _clear_limits(self) -> None:
+        """Remove the limits of contact and speed, and choose the numbers that limits would apply to."""
         self.speed_limits[:] = np.inf
         self._limits.load_share[:] = 0.0
         self._limits.status[:] = 0
         self._limits_set: ContactLimits | None = None
         # Arm, and column of a sample, of each number that limits apply to.
         columns = np.arange(FELT)
-        is_limited = (columns >= JOINTS) | (columns < self.arms.joint_count[:, None])
-        self._limited = np.nonzero(is_limited)
+        is_wrist = columns >= JOINTS
+        is_joint = columns < self.arms.joint_count[:, None]  # (arms, FELT)
+        self._limited = np.nonzero(is_wrist | is_joint)
 
     def begin(self, limits: ContactLimits | None = None, limited: Sequence[Channel] = ()) -> None:
         """Begin a control step under ``limits`` of the ``limited`` channels."""
-        self._done = 0
-        self._row_began = 0
-        self._force_before = 0.0
+        self._substeps_done = 0
+        self._row_start = 0
+        self._force_of_earlier_rows = 0.0
         self._pressed = self.load > 1.0
         self._limits.load_share[0] = 0.0
         self._limits.status[:] = 0
         if limits is None:
             return
         if limits is not self._limits_set:
-            self._limits.load_limits[self._limited] = limits.most(limited)
+            self._limits.load_limits[self._limited] = limits.limit_of_each(limited)
             self._limits_set = limits
         self._limits.status.armed = True
         self._limits.status.stops = limits.stays
@@ -149,7 +155,7 @@ class Simulation:
         Args:
             action: (A,) in robosuite's units.
             hold: the arms are to stay, which no action says: one of no change follows a push, a torque of zero brakes
-                nothing. So they are braked beneath their controllers (``control.brake``).
+                nothing. So they are braked beneath their controllers (``controllers.brake``).
         """
         held = self._goals.held
         if hold:
@@ -157,7 +163,7 @@ class Simulation:
         else:
             held[:] = 0
         self._action[:] = action
-        self._fresh = True
+        self._has_new_command = True
 
         # Fingers that close on a table would lift the hand.
         stays_open = hold and self._pressed
@@ -169,23 +175,23 @@ class Simulation:
         """Run ``count`` substeps of the control step that was begun."""
         if not self.compiled:
             self._run_robosuites(count)
-        elif self.keeps_history and self._done == 0:
+        elif self.keeps_history and self._substeps_done == 0:
             sensed = self.data.sensordata
             wrenches = [sensed[at : at + 6].copy() for at in self.arms.wrench]
             self._run(count)
             self._remember(wrenches)
         else:
             self._run(count)
-        self._fresh = False
-        self._done += count
+        self._has_new_command = False
+        self._substeps_done += count
 
     def _run_robosuites(self, count: int) -> None:
         """Run substeps under robosuite's own controllers."""
-        first = self._done - self._row_began
+        first = self._substeps_done - self._row_start  # since the row began
         for k in range(first, first + count):
             nominal = self.nominal.now()
             self.env.sim.step1()
-            self.env._pre_action(self._action.copy(), self._fresh)
+            self.env._pre_action(self._action.copy(), self._has_new_command)
             kernels.evaluate_nominal(self.views, nominal)
             if self._goals.held.any() or self.speed_limits.min() < np.inf:
                 kernels.brake_beneath(
@@ -194,15 +200,19 @@ class Simulation:
             self.env.sim.step2()
             kernels.sample(self.views, nominal, self.arms, k, self._samples)
             kernels.feel(self._goals, self._limits, k, self._samples)
-            self._fresh = False
+            self._has_new_command = False
 
     def _run(self, count: int) -> None:
+        """Run compiled substeps."""
         nominal = self.nominal.now()
         if nominal is not self._bound_nominal:
             self._bind(nominal)
-        kernels.run(self._bound, self._fresh, self._done - self._row_began, count)
+        kernels.run(
+            self._bound, self._has_new_command, self._substeps_done - self._row_start, count
+        )
 
     def _bind(self, nominal: NominalViews) -> None:
+        """Prepare the arguments of compiled substeps."""
         self._bound_nominal = nominal
         self._bound: Bound = bind(
             self.views,
@@ -217,8 +227,8 @@ class Simulation:
 
     def begin_row(self) -> None:
         """Begin another row of the stream; the contact force goes on to be that of the whole control step."""
-        self._force_before = self.contact_force
-        self._row_began = self._done
+        self._force_of_earlier_rows = self.contact_force
+        self._row_start = self._substeps_done
 
     @property
     def passed_limit(self) -> int | None:
@@ -237,14 +247,14 @@ class Simulation:
     def braked(self) -> float:
         """The share of the control step's substeps in which an arm was slowed down beneath its controller."""
         braked = float(self._limits.status[0]["braked"])
-        return braked / max(1, self._done * len(self.parts))
+        return braked / max(1, self._substeps_done * len(self.parts))
 
     @property
     def felt(self) -> Floats:
         """(K, N) noiseless loads in each substep since the row began: of each arm the external torque of its joints
         [N m], then the force at its wrist [N]."""
         arms, columns = self._limited
-        return self._samples[arms, : self._done - self._row_began, columns].T
+        return self._samples[arms, : self._substeps_done - self._row_start, columns].T
 
     @property
     def felt_mean(self) -> Floats:
@@ -254,7 +264,7 @@ class Simulation:
     @property
     def contact_forces(self) -> Floats:
         """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
-        forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
+        forces = self._samples[:, : self._substeps_done - self._row_start, kernels.CONTACT]
         return np.linalg.norm(forces, axis=2).max(axis=0)
 
     def sense(self, other_values: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
@@ -262,19 +272,19 @@ class Simulation:
 
         The arguments are those of ``compiled_substeps.sense``.
         """
-        if self._done > self._row_began:
-            self._summarise(self._done - self._row_began)
+        if self._substeps_done > self._row_start:
+            self._summarise(self._substeps_done - self._row_start)
         own = self.proprioception
         row = rng.standard_normal(len(noise))
         kernels.sense(own.sources, own.places, other_values, noise, row)
         return row
 
     def _summarise(self, count: int) -> None:
-        """Summarise ``count`` substeps, and take the force of the row into that of the control step; NaN stays."""
+        """Summarise ``count`` substeps of a row; the contact force is the largest of the control step so far."""
         own = self.proprioception
         self.contact_force = kernels.summarise(self._samples, count, own.mean, own.peak, own.last)
-        if self.contact_force <= self._force_before:
-            self.contact_force = self._force_before
+        if self.contact_force <= self._force_of_earlier_rows:  # NaN is not, and stays
+            self.contact_force = self._force_of_earlier_rows
 
     def _remember(self, wrenches: list[Floats]) -> None:
         """Fill the buffers that robosuite fills in the first substep; the acceleration is its running estimate."""

@@ -12,7 +12,7 @@ motion is m |v|, with the reflected mass 1/m = nᵀ J M⁻¹ Jᵀ n, n = v/|v| (
 stretched.
 
 Where actions mean something else they stay as they are, and a brake slows the arm down beneath its controller once it
-is too fast (``control.slow_down``).
+is too fast (``controllers.slow_down``).
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class SpeedLimiter:
         return slow_action
 
     def _bind(self, limits: ContactLimits) -> None:
-        beside_base = limits.stricter(1.0, limits.hand_speed / 2)
+        beside_base = limits.reduced(1.0, limits.hand_speed / 2)
         self._limits = limits
         self._bound: Bound = bind(
             self._views,

@@ -30,7 +30,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     # channels that contact limits apply to, of one arm after another
     felt_channels: tuple[Channel, ...]
     _action: NDArray[np.float32]
-    _actions: Actions
+    _actions: Actions  # the action space, and how actions reach the controllers
     _objects: ObjectSensors
     _senses: Senses
     _row_substeps: int
@@ -76,7 +76,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             if self.contact_limits is None:
                 self.contact_limits = own
             elif own is not None:
-                self.contact_limits = self.contact_limits.and_those_of(own, self.felt_channels)
+                self.contact_limits = self.contact_limits.strictest_with(own, self.felt_channels)
 
     def _run(self, action: NDArray[np.float32]) -> None:
         """Run the substeps of a control step, and read the rows of the stream before its end."""
@@ -89,11 +89,12 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         stride = self._row_substeps
         if self.substep_hooks:
             stride = 1
-        for done in range(stride, self.substeps + 1, stride):
+        for substeps_done in range(stride, self.substeps + 1, stride):
             self.simulation.advance(stride)
             for hook in self.substep_hooks:
-                hook(done - 1)
-            if done % self._row_substeps == 0 and done < self.substeps:
+                hook(substeps_done - 1)
+            ends_row = substeps_done % self._row_substeps == 0
+            if ends_row and substeps_done < self.substeps:
                 self._end_row()
 
         if limits is not None and limits.stays and self.simulation.passed_limit is not None:
@@ -114,13 +115,15 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         self._command(self._actions.checked(action))
 
     def _command(self, action: NDArray[np.float32]) -> None:
-        held = self.holding
-        self.holding = held and self.keeps_holding
-        if held:
+        """Give the controllers an action (A,), slowed down, or that of staying where the arms are held."""
+        is_held = self.holding
+        if not self.keeps_holding:
+            self.holding = False  # it lasts for one command
+        if is_held:
             self._action = self._actions.resting(self._action)
         else:
             self._action = self._slowed(action)
-        self.simulation.command(self._delivered(self._action), held)
+        self.simulation.command(self._delivered(self._action), is_held)
 
     def _slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action (A,) at the hand speed that the contact limits allow."""
@@ -145,6 +148,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._read().row
 
     def _read(self, within_step: bool = False) -> Reading:
+        """Read all sensors; ``within_step`` for a row before the last of a control step."""
         return self._senses.read(
             self.simulation.sense,
             self._objects,

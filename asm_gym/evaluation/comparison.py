@@ -161,6 +161,13 @@ class Bound(NamedTuple):
         return cls(auroc=float(auroc), found=found, delays=Delays.of(delays))
 
 
+class LeftOut(NamedTuple):
+    """How much of a run's recordings was not used."""
+
+    failed_episodes: int = 0  # healthy episodes in which the policy failed
+    crashed_scenes: int = 0  # scenes, by task and seed, in which the robot crashes without a fault
+
+
 @dataclass(frozen=True, eq=False)
 class BenchmarkResult:
     """The scores of monitors on a run's episodes, and the bound of the ideal observer."""
@@ -169,8 +176,7 @@ class BenchmarkResult:
     detectability: Sequence[Detectability]  # of every faulty episode
     rate: float  # false-alarm rate at which monitors are judged
     window_s: float  # an alarm within this time of the onset is a detection [s]
-    # numbers of nominal episodes in which the policy failed, and crashed
-    left_out: tuple[int, int] = (0, 0)
+    left_out: LeftOut = LeftOut()  # noqa: RUF009  (immutable)
 
     @property
     def promise(self) -> AlarmRate:

@@ -22,8 +22,8 @@ from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors.calibration import AlarmRate
 
 SPLITS = 20  # of nominal episodes into halves
-UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely
-BRIEF = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right channel")
+UNLIKELY = 0.025  # a promise counts as broken if so many false alarms have a smaller probability
+BRIEF_HEADINGS = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right channel")
 """Columns that a terminal shows, beside the share found at the run's own rate."""
 
 
@@ -45,7 +45,7 @@ def _delays(m: DetectionMetrics) -> str:
 
 
 def _by_response(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetrics], str]:
-    """Return a cell of a measure under each response: the policy alone → the override."""
+    """Return the function for a cell: a measure with the policy alone → the same with the override."""
     return lambda m: " → ".join(map(measure, m.outcomes))
 
 
@@ -104,6 +104,7 @@ def _auroc(m: DetectionMetrics) -> str:
 
 
 def _found(promise: AlarmRate, m: DetectionMetrics) -> str:
+    """Format the share of faults found, or how many calibration episodes the promise needs."""
     share = m.found.get(promise)
     if share is None:
         if promise.per == HOUR:
@@ -125,15 +126,16 @@ def _false_alarms(m: DetectionMetrics) -> str:
 
 def monitors_table(result: BenchmarkResult) -> Table:
     """Return the monitors side by side, the ideal observer on top."""
-    failed, crashed = result.left_out
+    left_out = result.left_out
     caption = (
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds and severities "
         "of fault that an ideal observer can detect; thresholds from separate nominal episodes, "
         f"delays and alarms at a false-alarm rate of {100 * result.rate:g} % of episodes; in "
         "brackets 95 % intervals over resampled scenes and calibration episodes. AUROC: against "
         "nominal episodes over the same steps. Needs: calibration episodes for that rate, where "
-        f"there were fewer. Left out: nominal episodes in which the policy failed ({failed}) or "
-        f"crashed ({crashed}), and faults in such scenes."
+        "there were fewer. Left out: nominal episodes in which the policy failed "
+        f"({left_out.failed_episodes}) or crashed ({left_out.crashed_scenes}), and faults in such "
+        "scenes."
     )
     hidden = [_in_words(kind) for kind, is_visible in result.visible.items() if not is_visible]
     if hidden:
@@ -145,14 +147,14 @@ def monitors_table(result: BenchmarkResult) -> Table:
     ideal = result.bound(result.visible_kinds)
     found = [percent(ideal.found.get(promise)) for promise in promises]
     delay = milliseconds(ideal.delays.median_ms)
-    first = (IDEAL, f"{ideal.auroc:.3f}", *found, delay, "", "", "")
-    return Table(caption, monitors.headings, [first, *monitors.rows])
+    ideal_row = (IDEAL, f"{ideal.auroc:.3f}", *found, delay, "", "", "")
+    return Table(caption, monitors.headings, [ideal_row, *monitors.rows])
 
 
 def brief_monitors_table(result: BenchmarkResult) -> Table:
     """Return the chief columns without their intervals, narrow enough for a terminal."""
     table = monitors_table(result)
-    shown = (*BRIEF, f"Found at {_rate(result.promise)}")
+    shown = (*BRIEF_HEADINGS, f"Found at {_rate(result.promise)}")
     columns = [n for n, heading in enumerate(table.headings) if heading in shown]
     rows = []
     for row in table.rows:
@@ -223,6 +225,7 @@ def _found_lead(promise: AlarmRate, first: DetectionMetrics, other: DetectionMet
 
 
 def _lead(difference: Estimate, scale: float, digits: int) -> str:
+    """Format how far the first monitor is ahead, its interval, and the verdict."""
     verdict = "within chance"
     if difference.low > 0:
         verdict = "ahead"
@@ -232,20 +235,22 @@ def _lead(difference: Estimate, scale: float, digits: int) -> str:
     return f"{value} ({low} to {high}), {verdict}"
 
 
-# ------------------------------------------------------------------ promises and what they came to
+# ------------------------------------------------------------------ promises and actual false alarms
 
 
 def kept_table(result: BenchmarkResult) -> Table:
     """Return the false alarms in nominal test episodes, beside the promise of each threshold."""
     monitors = list(result.monitors.values())
-    promises = {promise for m in monitors for promise in m.calibration.thresholds}
+    promises: set[AlarmRate] = set()
+    for monitor in monitors:
+        promises.update(monitor.calibration.thresholds)
     by_episode = sorted(promise for promise in promises if promise.per == EPISODE)
     by_hour = sorted((promise for promise in promises if promise.per == HOUR), reverse=True)
 
     nominal = monitors[0].nominal
     hours = sum(len(trace) * trace.dt for trace in nominal) / 3600
-    solved = [trace.outcome for trace in nominal if trace.outcome.success]
-    unsafe = Share.of([outcome.unsafe for outcome in solved])
+    outcomes_of_solved = [trace.outcome for trace in nominal if trace.outcome.success]
+    unsafe = Share.of([outcome.unsafe for outcome in outcomes_of_solved])
     caption = (
         f"False alarms in {len(nominal)} nominal test episodes of {hours:.2f} hours, by the "
         "promise of the threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in "
@@ -269,6 +274,7 @@ def _by_promise(
 
 
 def _kept(promise: AlarmRate, m: DetectionMetrics) -> str:
+    """Format the false alarms at the threshold of a promise; empty where the monitor has none."""
     threshold = m.calibration.thresholds.get(promise)
     if threshold is None:
         return ""
@@ -289,8 +295,8 @@ def kept_rate(rate: Rate, promised: float) -> str:
 def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str:
     """Format the share of episodes with an alarm, and say if the threshold broke its promise.
 
-    ``over`` of n calibration maxima exceed the threshold. The share of fresh ones that exceed it is itself drawn, from
-    Beta(over + 1, n - over), so their count is beta-binomial.
+    ``over`` of n calibration maxima exceed the threshold. Then the probability that a test episode exceeds it has the
+    distribution Beta(over + 1, n - over), so the number of test episodes that do is beta-binomial.
     """
     low, high = share.interval
     text = f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
@@ -298,8 +304,8 @@ def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str
     over = int((calibration.maxima > threshold).sum())
     if not share.n or over >= n:
         return text
-    at_least_so_many = stats.betabinom.sf(share.k - 1, share.n, over + 1, n - over)
-    if at_least_so_many < UNLIKELY:
+    chance = stats.betabinom.sf(share.k - 1, share.n, over + 1, n - over)  # of k alarms or more
+    if chance < UNLIKELY:
         return f"{text}, broken"
     return text
 
@@ -316,13 +322,14 @@ def splits_table(result: BenchmarkResult) -> Table:
 
 
 def _over_splits_of_nominal(promise: AlarmRate, m: DetectionMetrics) -> str:
-    """Return ``over_splits`` of the nominal episodes for calibration and test."""
+    """Return the cell of ``over_splits``, whose units are the nominal episodes for calibration and test."""
     surprises = [trace.surprise for trace in m.nominal]
     if promise.per == EPISODE:
-        peaks = [surprise.max() for surprise in surprises]
-        maxima = np.concatenate([m.calibration.maxima, peaks])
-        one_each = np.ones(len(maxima))
-        return over_splits(m, Blocks(maxima, one_each), promise)
+        test_maxima = [surprise.max() for surprise in surprises]
+        maxima = np.concatenate([m.calibration.maxima, test_maxima])
+        one_hour_each = np.ones(len(maxima))
+        return over_splits(m, Blocks(maxima, one_hour_each), promise)
+
     blocks = Blocks.of(surprises, m.nominal[0].dt)
     calibration = m.calibration.blocks
     if calibration is not None:
@@ -343,15 +350,15 @@ def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
     rng = np.random.default_rng(0)
     windows = Windows(m.faulty, m.window_s)
     size = len(units.maxima)
-    alarms = []  # per unit, of each split
-    found = []  # share of the faults, of each split
+    alarms = []  # of each split: false alarms an hour, or an episode
+    found = []  # of each split: share of the faults
     for _ in range(SPLITS):
         half = np.zeros(size, bool)
         half[rng.permutation(size)[: size // 2]] = True
         calibration = Blocks(units.maxima[half], units.hours[half])
         try:
             threshold = promise.threshold(calibration.maxima, calibration)
-        except ValueError:  # too few
+        except ValueError:  # too few units for this promise
             return ""
         false_alarms = (units.maxima[~half] > threshold).sum()
         alarms.append(false_alarms / units.hours[~half].sum())

@@ -21,13 +21,13 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from asm_gym.data.column_behaviour import is_constant
-from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.table_layout import is_numeric
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.statistics import Floats
 from asm_gym.files import written_whole
+from asm_gym.readings import spans
 
 # Okabe and Ito 2008
 BLUE = "#0072B2"

@@ -10,10 +10,10 @@ import numpy as np
 from asm_gym.data.alarm_reasons import TOGETHER_S, blamed, reason
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
-from asm_gym.data.episode import spans
 from asm_gym.data.logs import Log
 from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.readings import spans
 
 HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "clock [s]", "date")
 FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode, spans
+from asm_gym.data.episode import Episode
 from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.evaluation.defaults import TRANSIENT
+from asm_gym.readings import spans
 
 Floats = NDArray[np.floating[Any]]
 
@@ -31,7 +32,7 @@ class InterventionOutcome(NamedTuple):
 
     @property
     def unsafe(self) -> bool:
-        """Whether something was pressed harder than a moment allows, or the policy was overridden."""
+        """Whether the force exceeded the limit for transient contact, or the policy was overridden."""
         return self.overridden or self.contact_force > TRANSIENT
 
 
@@ -54,10 +55,10 @@ class ScoredEpisode:
     monitor: str = ""
     acting: str = POLICY_ALONE  # else the response to an alarm, such as ``"hold"``
     affected_channels: frozenset[str] = frozenset()  # those in which the fault shows first
-    # with the greatest share of surprise at ``first_alarm``; empty without an alarm
+    # the channel with the greatest share of surprise at ``first_alarm``; empty without an alarm
     top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
-    # (T,) surprise that a knock, or a stop, excused
+    # (T,) surprise that raised no alarm, by the event that excused it: a knock, or a stop
     excused: Mapping[str, Floats] = field(default_factory=dict)
     # (T, D) shares of the channels in the surprise, for figures alone
     attribution: Floats | None = None
@@ -137,8 +138,10 @@ class ScoredEpisode:
 
     def delay_within(self, window_s: float) -> float:
         """Return the delay of an alarm within ``window_s`` of the onset [s]; ``inf`` if missed."""
-        after = self.detected_after
-        if self.delay is None or after is None or after >= window_steps(window_s, self.dt):
+        rows_after = self.detected_after
+        if self.delay is None or rows_after is None:
+            return math.inf
+        if rows_after >= window_steps(window_s, self.dt):
             return math.inf
         return self.delay
 
@@ -146,7 +149,8 @@ class ScoredEpisode:
         """Return the rows within ``window_s`` of the onset, in which a detection counts; all without a fault."""
         if self.onset is None:
             return slice(0, len(self))
-        return slice(self.onset, min(self.onset + window_steps(window_s, self.dt), len(self)))
+        end = self.onset + window_steps(window_s, self.dt)
+        return slice(self.onset, min(end, len(self)))
 
     def at(self, threshold: float) -> ScoredEpisode:
         """Return the same surprise judged by another threshold."""
@@ -163,7 +167,7 @@ class ScoredEpisode:
 
 
 def window_steps(window_s: float, dt: float) -> int:
-    """Return how many rows a window holds, at least one."""
+    """Return how many rows of period ``dt`` [s] a window holds, at least one."""
     if not window_s > 0:
         raise ValueError(f"window_s must be > 0, got {window_s}")
     return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
@@ -174,5 +178,7 @@ def onset_row(episode: Episode) -> int | None:
     label = episode.labelled
     if label.role != "faulty" or label.onset is None:
         return None
+    # One contact force a control step; where none was measured, one row a step.
     steps = len(episode.contact_force) or len(episode)
-    return label.onset * (len(episode) // steps)
+    rows_per_step = len(episode) // steps
+    return label.onset * rows_per_step

@@ -15,7 +15,7 @@ import numpy as np
 from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import EPISODE, HOUR, conformal_episodes
-from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
+from asm_gym.evaluation.comparison import BenchmarkResult, LeftOut, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration
@@ -32,16 +32,16 @@ CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
 AT_ONCE = 256  # episodes scored together: the attribution of more would fill the memory
 
 Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
-"""``[task(item) for item in items]``, by whichever workers."""
+"""``map_items(task, items)`` returns ``[task(item) for item in items]``, perhaps by several processes."""
 
 
 class Recordings(NamedTuple):
     """The recordings of a run."""
 
-    # without failed nominal episodes, and without scenes in which the robot crashes
+    # by role, without failed healthy episodes, and without scenes in which the robot crashes
     roles: dict[str, list[Episode]]
-    left_out: tuple[int, int]  # numbers of nominal episodes that failed, and of scenes with a crash
-    # all of the role nominal: a faulty episode equals its twin until the onset
+    left_out: LeftOut
+    # all of the role nominal, failed ones too: a faulty episode equals its twin until the onset
     twins: list[Episode]
 
     @classmethod
@@ -64,11 +64,15 @@ class Recordings(NamedTuple):
                     "there is nothing normal to learn or to test on"
                 )
         twins = [r for r in recordings if r.labelled.role == "nominal"]
-        return cls(roles=roles, left_out=(failed, len(crashed)), twins=twins)
+        return cls(
+            roles=roles,
+            left_out=LeftOut(failed_episodes=failed, crashed_scenes=len(crashed)),
+            twins=twins,
+        )
 
 
 def scenes_with_crash(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
-    """Return task and seed of the solved nominal episodes in which the robot crashes."""
+    """Return task and seed of the solved healthy episodes in which the robot crashes."""
     solved = [r for r in recordings if r.labelled.role in HEALTHY_ROLES and r.success]
     labels = [r.labelled for r in solved]
     # Episodes that are judged do not say what is usual.
@@ -78,7 +82,7 @@ def scenes_with_crash(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
 
 
 @lru_cache(maxsize=1)
-def read(paths: tuple[Path, ...]) -> Recordings:
+def read_recordings(paths: tuple[Path, ...]) -> Recordings:
     """Load these files by role; the last ones are cached for the next monitor."""
     return Recordings.of([load_episode(path) for path in paths])
 
@@ -90,30 +94,31 @@ def benchmark(
     rate: float,
     window_s: float,
     seed: int,
-    each: Map,
+    map_items: Map,
 ) -> BenchmarkResult:
     """Learn from the episodes for fit and calibration, and score all others with every monitor.
 
-    ``folder`` keeps the fitted monitors; ``each`` maps a function over items, as ``parallel_map`` does.
+    ``folder`` keeps the fitted monitors; ``map_items`` is such as ``parallel_map``.
     """
     paths = tuple(file.resolve() for file in files)
     folder = folder.resolve()
-    models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once
+    names_by_model: dict[str, list[str]] = {}  # a model that is judged in two ways is fitted once
     for name in monitors:
-        models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
+        names_by_model.setdefault(name.removesuffix(EVIDENCE), []).append(name)
 
-    def score(names: Sequence[str]) -> list[DetectionMetrics]:
-        roles = read(paths).roles
+    def score_model(names: Sequence[str]) -> list[DetectionMetrics]:
+        roles = read_recordings(paths).roles
         results = []
         for name in names:
             monitor = fitted(folder, name, roles["fit"], seed)
-            results.append(judged(name, monitor, roles, rate, window_s))
+            results.append(calibrated_metrics(name, monitor, roles, rate, window_s))
         return results
 
-    by_name = {m.name: m for results in each(score, list(models.values())) for m in results}
-    recordings = read(paths)
+    results_by_model = map_items(score_model, list(names_by_model.values()))
+    metrics = {result.name: result for results in results_by_model for result in results}
+    recordings = read_recordings(paths)
     return BenchmarkResult(
-        monitors={name: by_name[name] for name in monitors},
+        monitors={name: metrics[name] for name in monitors},
         detectability=detectability_of(
             recordings.twins, recordings.roles.get("faulty", []), window_s
         ),
@@ -123,23 +128,25 @@ def benchmark(
     )
 
 
-def judged(
+def calibrated_metrics(
     name: str,
     monitor: CalibratedMonitor,
     by_role: Mapping[str, Sequence[Episode]],
     rate: float,
     window_s: float,
 ) -> DetectionMetrics:
-    """Calibrate a fitted monitor, and score all other episodes."""
+    """Calibrate a fitted monitor, and score the nominal and the faulty episodes."""
     monitor.calibrate(by_role["calibration"], rate)
     maxima = monitor.maxima_
     blocks = monitor.blocks_
     assert maxima is not None
     assert blocks is not None
 
-    possible = [r for r in RATES if len(maxima) >= conformal_episodes(r)]
-    promises = [AlarmRate(r, EPISODE) for r in sorted({rate, *possible})]
-    promises += [AlarmRate(r, HOUR) for r in PER_HOUR if r * blocks.total >= 1.0]
+    # Further rates that so many episodes and hours can promise.
+    rates = [r for r in RATES if len(maxima) >= conformal_episodes(r)]
+    hourly_rates = [r for r in PER_HOUR if r * blocks.total >= 1.0]
+    promises = [AlarmRate(r, EPISODE) for r in sorted({rate, *rates})]
+    promises += [AlarmRate(r, HOUR) for r in hourly_rates]
     thresholds = {promise: monitor.threshold_at(**promise.named) for promise in promises}
     threshold = thresholds[AlarmRate(rate, EPISODE)]
     return DetectionMetrics(
@@ -164,7 +171,10 @@ def code_digest() -> str:
 
 
 def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
-    """Return the monitor fitted on these episodes; the folder keeps it by its settings, code and episodes."""
+    """Return the monitor fitted on these episodes, from ``folder`` if it was fitted before.
+
+    A file is named for the model, and digests of its settings, its episodes and our code.
+    """
     model = name.removesuffix(EVIDENCE)
     monitor = make_monitor(name, recordings[0].spec, seed=seed)
     settings = json.dumps((model, __version__, monitor.get_params()), default=str)
@@ -173,7 +183,7 @@ def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) ->
         digest.update(str(recording.stream.shape).encode())
         digest.update(recording.stream.tobytes())
     path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}-{code_digest()}.asm"
-    with suppress(FileNotFoundError, ValueError):  # a damaged one is fitted anew
+    with suppress(FileNotFoundError, ValueError):  # fitted anew if missing or damaged
         return monitor_class(name).load(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.fit(recordings).save(path)
@@ -186,8 +196,8 @@ def traces_of(
     """Score recordings, judged at this threshold."""
     traces = []
     for first in range(0, len(episodes), AT_ONCE):
-        some = episodes[first : first + AT_ONCE]
-        for episode, surprise in zip(some, monitor.score_episodes(some), strict=True):
+        group = episodes[first : first + AT_ONCE]
+        for episode, surprise in zip(group, monitor.score_episodes(group), strict=True):
             label = episode.labelled
             force = float(np.max(episode.contact_force, initial=0.0))
             trace = ScoredEpisode(

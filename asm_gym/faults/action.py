@@ -44,7 +44,7 @@ class ActionFault(HookedFault):
 
         def change(action: Action) -> Action:
             delivered = action.copy()
-            delivered[axes] = self.deliver(action[axes], clock.k, memory)
+            delivered[axes] = self.deliver(action[axes], clock.steps, memory)
             return delivered
 
         return change

@@ -28,7 +28,7 @@ Interface = Any
 class Clock:
     """Counts the control steps since a fault's onset."""
 
-    k: int = 0
+    steps: int = 0
 
 
 def within(
@@ -38,8 +38,8 @@ def within(
     high: float = LARGEST_PARAMETER,
     above: float | None = None,
 ) -> Any:
-    """Declare a parameter of a fault, and its bounds."""
-    if above is not None:
+    """Declare a parameter of a fault: a dataclass field with bounds, which ``low`` and ``high`` include."""
+    if above is not None:  # takes the place of ``low``
         low = None
     return field(default=default, metadata={"low": low, "high": high, "above": above})
 
@@ -74,7 +74,7 @@ class Fault(ABC):
 
     def __post_init__(self) -> None:
         for parameter in fields(self):
-            _check(parameter, getattr(self, parameter.name))
+            _check_parameter(parameter, getattr(self, parameter.name))
 
     @property
     def name(self) -> str:
@@ -101,20 +101,26 @@ class Fault(ABC):
     def labels(self, env: Interface) -> frozenset[str]:
         """Return the stream elements in which this fault shows first; all where the environment is not robosuite's."""
         every = not isinstance(env, RobosuiteEnv)
-        channels = [c for c in env.measured_spec.channels if every or c.group in self.groups]
-        return frozenset(label for c in channels for label in c.labels)
+        labels: set[str] = set()
+        for channel in env.measured_spec.channels:
+            if every or channel.group in self.groups:
+                labels.update(channel.labels)
+        return frozenset(labels)
 
     def inject(self, env: RobosuiteEnv) -> Generator[None, None, None]:
-        """Run on to the next ``yield`` before every control step in which the fault acts; closing undoes it."""
+        """Apply the fault while the generator is open; closing it undoes the fault.
+
+        It must be advanced once before every control step in which the fault acts.
+        """
         clock = Clock()
         with self.applied(env, clock):
             while True:
                 yield
-                clock.k += 1
+                clock.steps += 1
 
 
 Edit = tuple[NDArray[Any], list[Any], Callable[[Any], Any]]
-"""An array of the simulator, the indices that are edited, and their value by the nominal value."""
+"""An array of the simulator, the indices to edit, and a function from nominal to edited value."""
 
 
 class EditingFault(Fault):
@@ -122,25 +128,25 @@ class EditingFault(Fault):
 
     @abstractmethod
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        """Return the edits."""
+        """Return what to edit at the onset."""
 
     @contextmanager
     def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
         with ExitStack() as stack:
-            for array, indices, rule in self.edits(env):
-                change = stack.enter_context(env.edits.edit(array, *indices))
-                change(rule)
+            for array, indices, edited_value in self.edits(env):
+                set_change = stack.enter_context(env.edits.edit(array, *indices))
+                set_change(edited_value)
             yield
 
 
 class HookedFault(Fault):
-    """One whose function is kept in a list of the environment: ``corruptions``, ``deliveries`` or ``substep_hooks``."""
+    """One that adds a function to a list of the environment: ``corruptions``, ``deliveries`` or ``substep_hooks``."""
 
-    hooks: ClassVar[str]
+    hooks: ClassVar[str]  # name of the list
 
     @abstractmethod
     def hook(self, env: Any, clock: Clock) -> Callable[[Any], Any]:
-        """Return the function."""
+        """Return the function, which may read the time since the onset from ``clock``."""
 
     @contextmanager
     def applied(self, env: Any, clock: Clock) -> Iterator[None]:
@@ -157,7 +163,7 @@ class JointFault(Fault):
     """One that acts on a ``joint``, counted from the base, 0 first; a second arm's go on after the first one's."""
 
     joint: int = 3
-    # those in which it shows first
+    # channels in which the fault shows first
     channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")
 
     def check(self, env: RobosuiteEnv) -> None:
@@ -182,24 +188,24 @@ class JointFault(Fault):
         return indices[self.joint]
 
 
-def _check(parameter: Field[Any], value: Any) -> None:
+def _check_parameter(parameter: Field[Any], value: Any) -> None:
     """Raise ValueError unless a parameter is of its type and within its bounds."""
     name = parameter.name
-    kind = parameter.type
+    annotation = parameter.type  # a string, as annotations are not evaluated
     bounds = parameter.metadata or {
         "low": -LARGEST_PARAMETER,
         "high": LARGEST_PARAMETER,
         "above": None,
     }
-    if kind == "float":
+    if annotation == "float":
         check_number(name, value, **bounds)
-    elif kind == "int" or (kind == "int | None" and value is not None):
+    elif annotation == "int" or (annotation == "int | None" and value is not None):
         check_number(name, value, whole=True, **bounds)
-    elif kind == "Vector3":
+    elif annotation == "Vector3":
         check_numbers(name, value, 3, low=bounds["low"], high=bounds["high"])
         if name == "direction" and not np.linalg.norm(value) > 0:
             raise ValueError(f"direction must not be all zero, got {value}")
-    elif kind == "str" and value != "":
+    elif annotation == "str" and value != "":
         check_text(name, value)
 
 
@@ -208,11 +214,11 @@ def steady_force(env: RobosuiteEnv, body: int, newtons: float, direction: Vector
     along = np.asarray(direction, np.float64)
     force = newtons * (along / float(np.linalg.norm(along)))
     forces = env.simulation.data.xfrc_applied
-    return forces, [(body, slice(0, 3))], lambda others: others + force
+    return forces, [(body, slice(0, 3))], lambda other_forces: other_forces + force
 
 
 def delayed(now: Any, steps: int, memory: list[Any]) -> Any:
-    """Return what was given ``steps`` calls ago, or the first that ``memory`` holds."""
+    """Add ``now`` to ``memory``; return what was given ``steps`` calls ago, or the first that it holds."""
     memory.append(now)
     if len(memory) > steps:
         return memory.pop(0)
@@ -227,8 +233,8 @@ def graded(
     Args:
         kind: of the fault.
         drawn: for parameters that are drawn for the episode, the attribute of what was drawn.
-        unit: the attribute that graded parameters are multiplied by.
-        parameters: the others; where one is a tuple, it is graded: a value for each severity.
+        unit: the attribute that graded parameters are multiplied by; none where empty.
+        parameters: all others. A tuple is a graded parameter: a value for each severity.
     """
 
     def make(episode: Any, severity: int) -> Fault:
@@ -247,7 +253,7 @@ def graded(
 def body_id(env: RobosuiteEnv, name: str) -> int:
     """Return the body called ``name``; raise ValueError, listing those that exist, where there is none."""
     model = env.simulation.model
-    # By a table of our own: asked for what is no string, MuJoCo ends the process.
+    # A dict of our own, as MuJoCo ends the process if it is asked for a name that is no string.
     bodies = {
         mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i): i for i in range(1, model.nbody)
     }

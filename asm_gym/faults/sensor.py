@@ -39,18 +39,18 @@ class SensorFault(HookedFault):
     element: int | None = 3
 
     def check(self, env: Interface) -> None:
-        self.where(env)
+        self.where(env)  # raises ValueError where there is no such channel or element
 
     def where(self, env: Interface) -> NDArray[np.intp]:
-        """Return the indices of the channel's numbers in a measured row."""
+        """Return the indices, in a measured row, of the numbers that the fault acts on."""
         spec = env.measured_spec
         check_choice("channel", self.channel, spec.slices)
-        span = np.arange(spec.size)[spec.slices[self.channel]]
+        of_channel = np.arange(spec.size)[spec.slices[self.channel]]
         if self.element is None:
-            return span
-        last = len(span) - 1
+            return of_channel
+        last = len(of_channel) - 1
         check_number(f"element of {self.channel}", self.element, low=0, high=last, whole=True)
-        return span[[self.element]]
+        return of_channel[[self.element]]
 
     def labels(self, env: Interface) -> frozenset[str]:
         return frozenset(env.measured_spec.labels[i] for i in self.where(env))
@@ -59,17 +59,17 @@ class SensorFault(HookedFault):
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Any:
         """Return what is read instead of the ``true`` readings (n,), k steps since the onset.
 
-        The fault's own ``memory`` holds the readings before the onset at first.
+        At first, the fault's own ``memory`` holds the last readings before the onset.
         """
 
     def hook(self, env: Interface, clock: Clock) -> Callable[[Floats], None]:
-        where = self.where(env)
-        memory = [env.measured[where]]
+        indices = self.where(env)
+        memory = [env.measured[indices]]
 
-        def edit(row: Floats) -> None:
-            row[where] = self.read(row[where], clock.k, memory)
+        def corrupt(row: Floats) -> None:
+            row[indices] = self.read(row[indices], clock.steps, memory)
 
-        return edit
+        return corrupt
 
 
 class Bias(SensorFault):
@@ -122,7 +122,7 @@ class Spikes(SensorFault):
 
 
 class Dropout(SensorFault):
-    """Lose readings, each with ``probability``: they read 0."""
+    """Lose all readings of a control step with ``probability``: they read 0."""
 
     probability: float = within(0.3, low=0, high=1)
 

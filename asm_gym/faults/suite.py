@@ -62,7 +62,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "missing_object",
     ),
 }
-"""Kinds to choose settings by, and kinds to report: half of each family, drawn once; added kinds are in neither."""
+"""Kinds by which settings are chosen, and kinds that are reported: half of each family, drawn once.
+
+Kinds that a user registers are in neither group.
+"""
 
 
 class Drawn(NamedTuple):
@@ -94,7 +97,7 @@ class Drawn(NamedTuple):
 
 Kind = Callable[[Drawn, int], Fault]
 
-# What kinds act on: parameters of the fault, and what is drawn for them.
+# What kinds act on: a parameter of the fault, and the attribute of ``Drawn`` that it is set to.
 _ON_LINK = {"body": "link"}
 _ON_HAND = {"body": "hand"}
 _ON_JOINT = {"joint": "joint"}
@@ -160,11 +163,11 @@ KINDS: Registry[Kind] = Registry(
 
 
 def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Return kinds by name, in order; ``development`` and ``test`` stand for those of the group."""
+    """Return kinds, in order and each once; ``development`` and ``test`` stand for the kinds of a group."""
     for name in names:
         if name not in GROUPS:
             check_choice("kind of fault", name, KINDS)
-    kinds: dict[str, None] = {}  # in order, each once
+    kinds: dict[str, None] = {}  # a set that keeps the order
     for name in names:
         kinds |= dict.fromkeys(GROUPS.get(name, (name,)))
     return tuple(kinds)
@@ -196,7 +199,8 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
     joint = int(rng.integers(len(robot._ref_joint_vel_indexes)))
     axis = int(rng.integers(flatdim(env.action_space) - len(env.gripper_actions)))
     translation = int(rng.integers(3))
-    fifth = model.jnt_bodyid[model.actuator_trnid[env.simulation.motors[4], 0]]
+    fifth_joint = model.actuator_trnid[env.simulation.motors[4], 0]
+    link = model.jnt_bodyid[fifth_joint]
     return Drawn(
         env=env,
         prefix=prefix_of(0, len(env.robots)),
@@ -204,7 +208,7 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
         axis=axis,
         translation=translation,
         direction=(x, y, z),
-        link=model.body(fifth).name,
+        link=model.body(link).name,
         hand=robot.robot_model.eef_name["right"],
         onset=onset,
         seed=seed,
@@ -214,14 +218,17 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
 def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:
     """Return the fault of one kind and severity for the episode with this seed."""
     check_choice("severity", severity, SEVERITIES)
-    fault = KINDS.find(kind)(draw(env, onset, seed), SEVERITIES.index(severity))
+    make = KINDS.find(kind)
+    fault = make(draw(env, onset, seed), SEVERITIES.index(severity))
     return replace(fault, onset=onset, seed=seed)
 
 
 def possible(kind: str, env: RobosuiteEnv) -> bool:
     """Whether the environment has what a kind of fault acts on: a loose object, a gripper."""
     try:
-        KINDS[kind](draw(env, 0, 0), 1).check(env)  # at any severity and seed the same
+        # The check comes out the same at any severity, onset and seed.
+        fault = KINDS[kind](draw(env, onset=0, seed=0), 1)
+        fault.check(env)
     except ValueError:
         return False
     return True

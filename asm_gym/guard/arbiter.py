@@ -25,10 +25,10 @@ LOG = logging.getLogger("asm_gym.safety")
 RELEASE_BELOW = 0.8  # share of the threshold that surprise must be under before a reflex hands back
 MOST_DOUBLINGS = 16  # of the time that a contact must have been gone for
 
-# Rows under the policy after which it is said that most of them alarm.
+# Rows under the policy after which the user is warned if most of them alarm.
 MOSTLY_AFTER = 200
 
-MOSTLY = (
+MOST_ROWS_ALARM = (
     "{} of the first {} rows under this policy alarm: something is wrong all the time, or the "
     'memory does not know this policy, task or set-up. Look with on_alarm="monitor" which channels '
     'info["asm"]["attribution"] names; if all is well, record episodes of it, and '
@@ -43,7 +43,7 @@ class Situation(NamedTuple):
     """Surprise is over the threshold, or something failed, is missing or presses."""
     presses: bool = False
     """A contact limit was passed within the step."""
-    spent: bool = False
+    pressed_too_often: bool = False
     """The arm has pressed too often, or with too much impulse, in this episode."""
     goes_on: bool = False
     """The response lets the policy act."""
@@ -51,13 +51,13 @@ class Situation(NamedTuple):
     """The response ends the episode, and has been held for long enough."""
     overdue: bool = False
     """The reflex has acted for as long as it may."""
-    calm: bool = False
+    surprise_low: bool = False
     """Surprise has been low for long enough, and nothing touches."""
-    free: bool = False
+    contact_gone: bool = False
     """The contact has been gone for long enough, and nothing presses."""
-    waited: bool = False
+    trial_due: bool = False
     """Held for long enough for a trial, nothing presses, and no sense tells of a contact."""
-    settled: bool = False
+    trial_passed: bool = False
     """The trial has gone well for long enough."""
 
 
@@ -77,7 +77,9 @@ REFLEX_ACTS = (REFLEX,)
 ANYBODY_ACTS = (*POLICY_ACTS, *REFLEX_ACTS)
 
 TRANSITIONS = (
-    Transition("give_up", ANYBODY_ACTS, ENDED, lambda s: s.spent, "pressed too often or much"),
+    Transition(
+        "give_up", ANYBODY_ACTS, ENDED, lambda s: s.pressed_too_often, "pressed too often or much"
+    ),
     Transition(
         "override", POLICY_ACTS, REFLEX, lambda s: s.presses, "presses harder than healthy motion"
     ),
@@ -89,7 +91,7 @@ TRANSITIONS = (
         "an alarm whose cause lets the policy go on",
     ),
     Transition("override", POLICY_ACTS, REFLEX, lambda s: s.alarm, "any other alarm"),
-    Transition("", (TRIAL,), POLICY, lambda s: s.settled, "no alarm for `release_after`"),
+    Transition("", (TRIAL,), POLICY, lambda s: s.trial_passed, "no alarm for `release_after`"),
     Transition(
         "*",
         REFLEX_ACTS,
@@ -98,9 +100,13 @@ TRANSITIONS = (
         "the cause turns out to be a sensor",
     ),
     Transition(
-        "release", REFLEX_ACTS, TRIAL, lambda s: s.calm, "calm for `release_after`, nothing touches"
+        "release",
+        REFLEX_ACTS,
+        TRIAL,
+        lambda s: s.surprise_low,
+        "calm for `release_after`, nothing touches",
     ),
-    Transition("release", REFLEX_ACTS, TRIAL, lambda s: s.free, "the contact has gone"),
+    Transition("release", REFLEX_ACTS, TRIAL, lambda s: s.contact_gone, "the contact has gone"),
     Transition(
         "give_up", REFLEX_ACTS, ENDED, lambda s: s.stops, "response `stop`, held for `try_after`"
     ),
@@ -109,7 +115,7 @@ TRANSITIONS = (
         "trial",
         REFLEX_ACTS,
         TRIAL,
-        lambda s: s.waited,
+        lambda s: s.trial_due,
         "held for `try_after`, nothing known to touch",
     ),
 )
@@ -118,7 +124,10 @@ TRANSITIONS = (
 
 def following(state: int, situation: Situation) -> Transition | None:
     """Return the first of ``TRANSITIONS`` that holds; None where nothing changes."""
-    return next((t for t in TRANSITIONS if state in t.within and t.when(situation)), None)
+    for transition in TRANSITIONS:
+        if state in transition.within and transition.when(situation):
+            return transition
+    return None
 
 
 class Decision(NamedTuple):
@@ -181,16 +190,17 @@ class Arbiter:
             self.response[index] = ""
 
     def may_go_on(self, index: int) -> bool:
-        """Return whether the policy of a robot may go on in alarm, for all the time that it did."""
+        """Return whether a robot's policy may act in alarm for one more row of this episode."""
         return bool(self._table.records["rows_going_on"][index] < self._rule.go_on)
 
     def count_policy_row(self, evidence: RowEvidence) -> str:
-        """Count a row under the policy; return what is to be said once, and early: most of what it does alarms."""
+        """Count a row under the policy; return a warning, once and early, if most of its rows alarm, else ""."""
         robot = evidence.robot
         robot.policy_rows += 1
         robot.policy_alarms += evidence.alarm
-        if robot.policy_rows == MOSTLY_AFTER and 2 * robot.policy_alarms > robot.policy_rows:
-            return MOSTLY.format(robot.policy_alarms, robot.policy_rows)
+        most_alarm = 2 * robot.policy_alarms > robot.policy_rows
+        if robot.policy_rows == MOSTLY_AFTER and most_alarm:
+            return MOST_ROWS_ALARM.format(robot.policy_alarms, robot.policy_rows)
         return ""
 
     def decide(self, evidence: RowEvidence, response: Response) -> Decision:
@@ -207,7 +217,7 @@ class Arbiter:
         if transition is not None:
             name = self._change_state(evidence.index, transition, response.name)
         if robot.refused and not name:
-            name = "override"
+            name = "override"  # the commander has called ``take_over`` already
         if name:
             LOG.info(
                 "%s: surprise %.3g, threshold %.3g%s",
@@ -237,37 +247,53 @@ class Arbiter:
             robot.override_rows = 0
             robot.rows_until_trial = self._rule.try_after
         robot.held_rows = 0
-        robot.free_rows = 0
-        robot.calm_rows = 0
+        robot.contact_free_rows = 0
+        robot.low_surprise_rows = 0
         robot.state = REFLEX
 
     def _count_row(self, evidence: RowEvidence, response: Response) -> None:
-        """Count the row."""
+        """Count the row, and keep the newest response to an alarm of a reflex."""
         robot = evidence.robot
         low = robot.threshold
         if robot.overridden:
             low *= RELEASE_BELOW
-        calm = robot.surprise <= low and not evidence.alarm
-        free = response.touched is False and robot.overridden
-        robot.calm_rows = calm * (robot.calm_rows + 1)
-        robot.free_rows = free * (robot.free_rows + 1)
+        if robot.surprise <= low and not evidence.alarm:
+            robot.low_surprise_rows += 1
+        else:
+            robot.low_surprise_rows = 0
+        if response.touched is False and robot.overridden:
+            robot.contact_free_rows += 1
+        else:
+            robot.contact_free_rows = 0
+
         if robot.overridden:
             self._count_override(evidence)
         else:
-            robot.rows_since_return += 1
-            robot.rows_going_on += evidence.alarm and self._lets_go_on(robot, response)
-            robot.strikes += robot.presses
-        if robot.state == REFLEX and evidence.alarm and response.name not in ("", *GOING_ON):
+            self._count_policy(evidence, response)
+        keeps_off = response.name not in ("", *GOING_ON)
+        if robot.state == REFLEX and evidence.alarm and keeps_off:
             self.response[evidence.index] = response.name
+
+    def _count_policy(self, evidence: RowEvidence, response: Response) -> None:
+        """Count a row of the policy."""
+        robot = evidence.robot
+        robot.rows_since_return += 1
+        if evidence.alarm and self._lets_go_on(robot, response):
+            robot.rows_going_on += 1
+        if robot.presses:
+            robot.strikes += 1
 
     def _count_override(self, evidence: RowEvidence) -> None:
         """Count a row of a reflex."""
         robot = evidence.robot
         robot.override_rows += 1
-        # Where nobody knows what is sensed, no trial comes nearer.
-        robot.held_rows = math.isfinite(robot.surprise) * (robot.held_rows + 1)
+        if math.isfinite(robot.surprise):
+            robot.held_rows += 1
+        else:
+            robot.held_rows = 0  # rows that nobody can judge bring no trial nearer
         # What the arm feels when it changes over to the reflex confirms nothing yet.
-        robot.confirmed |= evidence.alarm and robot.held_rows > self._rule.release_after
+        if evidence.alarm and robot.held_rows > self._rule.release_after:
+            robot.confirmed = True
 
     @staticmethod
     def _lets_go_on(robot: Any, response: Response) -> bool:
@@ -278,27 +304,29 @@ class Arbiter:
         """Return what the counted row comes to."""
         robot = evidence.robot
         rule = self._rule
-        overriding = robot.state == REFLEX
-        # A fault that is calm while nothing is asked of the robot has not gone.
+        # "stop" ends the episode: a fault that surprises nobody while the arm is held has not gone.
         stopping = self.response[evidence.index] == "stop"
-        undisturbed = not (stopping or robot.presses)
-        free_after = rule.free_after << min(int(robot.early_returns), MOST_DOUBLINGS)
-        goes_on = self._lets_go_on(robot, response) and (
-            response.name == "complete" or not overriding
-        )
+        may_return = not (stopping or robot.presses)
+
+        goes_on = self._lets_go_on(robot, response)
+        if robot.state == REFLEX and response.name != "complete":
+            goes_on = False
+
+        pressed_too_often = robot.strikes >= rule.strikes or robot.pressed_impulse > rule.impulse
+        was_low_for_long = robot.low_surprise_rows >= rule.release_after
+        contact_over_after = rule.free_after * 2 ** min(int(robot.early_returns), MOST_DOUBLINGS)
+        was_held_for_long = robot.held_rows >= robot.rows_until_trial
         return Situation(
             alarm=evidence.alarm,
             presses=bool(robot.presses),
-            spent=bool(robot.strikes >= rule.strikes or robot.pressed_impulse > rule.impulse),
+            pressed_too_often=bool(pressed_too_often),
             goes_on=goes_on,
             stops=bool(stopping and robot.held_rows >= rule.try_after),
             overdue=bool(robot.override_rows >= rule.max_override),
-            calm=not stopping and robot.calm_rows >= rule.release_after and not response.touched,
-            free=undisturbed and robot.free_rows >= free_after,
-            waited=undisturbed
-            and robot.held_rows >= robot.rows_until_trial
-            and response.touched is None,
-            settled=bool(robot.rows_since_return > rule.release_after),
+            surprise_low=not stopping and was_low_for_long and not response.touched,
+            contact_gone=may_return and robot.contact_free_rows >= contact_over_after,
+            trial_due=may_return and was_held_for_long and response.touched is None,
+            trial_passed=bool(robot.rows_since_return > rule.release_after),
         )
 
     def _change_state(self, index: int, transition: Transition, response: str) -> str:
@@ -311,7 +339,7 @@ class Arbiter:
             robot.state = transition.to
             if transition.to == TRIAL:
                 robot.rows_since_return = 0
-                robot.calm_rows = 0
+                robot.low_surprise_rows = 0
                 robot.on_trial = transition.name == "trial"
         if transition.name == "*":
             return response

@@ -117,11 +117,12 @@ class Commander:
             observe: returns the observation of a robot.
         """
         executed = np.empty_like(proposed)
-        before = self._proposed
+        previous = self._proposed
         self._proposed = proposed.copy()
-        if clip_actions(self._records, proposed, before, self._limits, idle, executed):
+        needs_choice = clip_actions(self._records, proposed, previous, self._limits, idle, executed)
+        if needs_choice:
             return self._choose_each(proposed, executed, idle, reflexes, observe)
-        self._executed = executed.copy()  # who asked may write to the other
+        self._executed = executed.copy()  # the caller may write to the array of the command
         return Command(executed, brakes=self._nobody, overridden=self._nobody)
 
     def _choose_each(
@@ -139,7 +140,8 @@ class Commander:
         records["refused"] = refused
         records["out_of_range"] &= ~idle
         brakes = np.zeros(len(proposed), bool)
-        overridden = (records["state"] == REFLEX) & ~idle | refused
+        reflex_acts = (records["state"] == REFLEX) & ~idle
+        overridden = reflex_acts | refused
         executed[idle] = np.clip(np.nan_to_num(facts.rest), facts.low, facts.high)
         failures: dict[int, str] = {}
         for robot in np.flatnonzero(overridden).tolist():
@@ -198,12 +200,12 @@ class Commander:
         if self._motion is not None:
             return self._motion.move(robot, reflex)
         policy = self._policies[robot]
-        fresh = robot not in self._policy_states
+        is_first = robot not in self._policy_states  # step of the override
         state = self._policy_states.get(robot)
-        if fresh and isinstance(policy, Hold):  # any other policy starts as in a new episode
+        if is_first and isinstance(policy, Hold):  # any other policy starts as in a new episode
             state = policy.begin(self.holding.executed[robot].copy())
         action, state = policy.predict(
-            observe(robot), state=state, episode_start=np.array([fresh]), deterministic=True
+            observe(robot), state=state, episode_start=np.array([is_first]), deterministic=True
         )
         self._policy_states[robot] = state
         return Motion(action, keeps_grip=False)
@@ -218,21 +220,22 @@ def _limits(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None) -> Fl
     limits = np.stack([facts.low, facts.high, facts.low, facts.high, any_step])
     if commands is None or commands.shape[1] != facts.rest.size:
         return limits
-    is_unbounded = ~(np.isfinite(facts.low) & np.isfinite(facts.high))
+    is_bounded = np.isfinite(facts.low) & np.isfinite(facts.high)
+    is_unbounded = ~is_bounded
     limits[LEAST_EXECUTED:, is_unbounded] = command_limits(commands)[:, is_unbounded]
     return limits.astype(np.float32)
 
 
 @partial(compiled, calls=(".",))
 def clip_actions(
-    robots: Any, proposed: Any, before: Any, limits: Any, idle: Any, executed: Any
+    robots: Any, proposed: Any, previous: Any, limits: Any, idle: Any, executed: Any
 ) -> bool:
     """Write the proposed actions (n, A) within their bounds, and mark those that cannot be executed.
 
     Args:
         robots: (n,) records.
         proposed: (n, A).
-        before: (n, A) proposed a step before; NaN at the beginning.
+        previous: (n, A) proposed a step before; NaN at the beginning.
         limits: (5, A) as ``_limits`` returns them.
         idle: (n,) nothing is done.
         executed: (n, A) written to.
@@ -240,28 +243,29 @@ def clip_actions(
     Returns:
         Whether any robot is overridden, refused or idle.
     """
-    unusual = False
+    needs_choice = False
     for n in range(len(robots)):
         robot = robots[n]
-        usable = clip_action(robot, proposed[n], before[n], limits, executed[n])
-        unusual = unusual or not usable or robot.state == REFLEX or idle[n]
-    return unusual
+        can_execute = clip_action(robot, proposed[n], previous[n], limits, executed[n])
+        needs_choice = needs_choice or not can_execute or robot.state == REFLEX or idle[n]
+    return needs_choice
 
 
 @inner
-def clip_action(robot: Any, proposed: Any, before: Any, limits: Any, executed: Any) -> bool:
+def clip_action(robot: Any, proposed: Any, previous: Any, limits: Any, executed: Any) -> bool:
     """Write one action (A,) within its bounds, and mark it; return whether it can be executed."""
-    finite = True
-    absurd = False
+    is_finite = True
+    is_out_of_range = False  # of healthy commands
     for i in range(len(proposed)):
         action = min(max(proposed[i], limits[LOW, i]), limits[HIGH, i])
-        step = np.abs(action - before[i])
-        finite = finite and np.isfinite(proposed[i])
-        absurd = absurd or action < limits[LEAST_EXECUTED, i]
-        absurd = absurd or action > limits[MOST_EXECUTED, i]
-        absurd = absurd or step > limits[GREATEST_STEP, i]
+        step = np.abs(action - previous[i])
+        is_finite = is_finite and np.isfinite(proposed[i])
+        is_out_of_range = is_out_of_range or action < limits[LEAST_EXECUTED, i]
+        is_out_of_range = is_out_of_range or action > limits[MOST_EXECUTED, i]
+        is_out_of_range = is_out_of_range or step > limits[GREATEST_STEP, i]
         executed[i] = action
     policy_acts = robot.state != REFLEX
-    robot.out_of_range = policy_acts and finite and absurd
-    robot.refused = policy_acts and (absurd or not finite)
-    return finite and not absurd
+    can_execute = is_finite and not is_out_of_range
+    robot.out_of_range = policy_acts and is_finite and is_out_of_range
+    robot.refused = policy_acts and not can_execute
+    return can_execute

@@ -38,10 +38,10 @@ class EpisodeLimits:
         careful = None
         if limits is not None:
             if facts.limits_contact:
-                limits.most(facts.felt_channels)  # which refuses limits of another arm
+                limits.limit_of_each(facts.felt_channels)  # which refuses limits of another arm
             if not acts:
                 limits = replace(limits, stays=False, hand_speed=np.inf)
-            careful = limits.stricter(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
+            careful = limits.reduced(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
 
         self._usual_and_careful = limits, careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))

@@ -143,7 +143,7 @@ class Guard:
         self._warned: set[tuple[int, str]] = set()  # robots, and the part that failed
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._everyone = ~self._nobody
-        self._all_active = True  # what the records say
+        self._all_active = True  # the field ``active`` of every record is True
         # What failed when the newest command was chosen, by robot.
         self._command_failures: Mapping[int, str] = NOTHING
 
@@ -183,7 +183,7 @@ class Guard:
         self.table.records["confirmed"] |= which
 
     def begin(self, which: Mask | None = None) -> RowReport:
-        """Begin new episodes of the robots of ``which`` (n,), all by default; return what there is to say of that."""
+        """Begin new episodes of the robots of ``which`` (n,), all by default; return the empty report."""
         if which is None:
             which = self._everyone
         self._arbiter.follow_thresholds(which)
@@ -198,10 +198,10 @@ class Guard:
         ):
             part.begin(which)
         self._warned = {(robot, part) for robot, part in self._warned if not which[robot]}
-        return self.nothing()
+        return self.empty_report()
 
-    def nothing(self) -> RowReport:
-        """Return that there is nothing to say of any robot, as before the first row of an episode."""
+    def empty_report(self) -> RowReport:
+        """Return the report before the first row of an episode: no alarm, nothing failed."""
         attribution = np.zeros((self._facts.count, self._spec.size))
         return RowReport(cleared(self.table.records), attribution)
 
@@ -217,11 +217,12 @@ class Guard:
         """Return what becomes of a robot's chunk of actions (k, A), after a row (D,) and the action (A,) done last."""
         facts = self._facts
         limits = self.limits[robot]
-        within = np.where(np.isfinite(chunk), np.clip(chunk, facts.low, facts.high), chunk)
+        clipped = np.clip(chunk, facts.low, facts.high)
+        clipped = np.where(np.isfinite(chunk), clipped, chunk)
         slows = limits is not None and np.isfinite(limits.hand_speed) and facts.limits_contact
         if not slows:
             limits = None
-        preview = preview_chunk(within, row, last, self.fitted.monitor, facts.dt, limits)
+        preview = preview_chunk(clipped, row, last, self.fitted.monitor, facts.dt, limits)
         if self._on_alarm == "monitor":
             return preview._replace(kept=chunk)
         return preview._replace(kept=chunk[: preview.at])
@@ -287,11 +288,7 @@ class Guard:
         rows = np.array(sensed.rows, np.float32)  # a copy, in which stale senses are left out
         self.table.rows = rows
         self.table.infos = sensed.infos
-        if active is None:
-            active = self._everyone
-        if active is not self._everyone or not self._all_active:
-            records["active"] = active
-            self._all_active = bool(active.all())
+        self._mark_active(active)
         records["ends_step"] = ends_step
         load = sensed.load
         if load is None:
@@ -312,20 +309,33 @@ class Guard:
             row.eventful = True
         return row
 
-    def _take_up_failures(self, row: JudgedRow, sensing: Mapping[int, str]) -> None:
-        """Take up what failed before the row is judged.
+    def _mark_active(self, active: Mask | None) -> None:
+        """Write to the records whose rows count (n,); None for all, which is seldom a change."""
+        if active is None:
+            if self._all_active:
+                return
+            active = self._everyone
+        self.table.records["active"] = active
+        self._all_active = bool(active.all())
 
-        Choosing the command may have failed, sensing, or the monitor: it was fitted meanwhile.
+    def _take_up_failures(self, row: JudgedRow, sensing_failures: Mapping[int, str]) -> None:
+        """Take up what failed before the row is judged, and mark the robots for which that is an alarm.
+
+        An action of the policy that is not finite is an alarm, as are a failure of sensing and a
+        monitor that was fitted meanwhile. A reflex that failed is none: the robot stays instead.
         """
-        refused = row.robots["refused"] & ~row.robots["out_of_range"]
-        choosing = self._command_failures
+        not_finite = row.robots["refused"] & ~row.robots["out_of_range"]
+        policy_failures: dict[int, str] = {}
+        reflex_failures: dict[int, str] = {}
+        for robot, failure in self._command_failures.items():
+            if not_finite[robot]:
+                policy_failures[robot] = failure
+            else:
+                reflex_failures[robot] = failure
         self._command_failures = NOTHING
-        policy = {robot: failure for robot, failure in choosing.items() if refused[robot]}
-        row.harmless_failures = {
-            robot: failure for robot, failure in choosing.items() if not refused[robot]
-        }
+        row.harmless_failures = reflex_failures
         row.eventful = True
-        row.fail(merged_failures(policy, sensing))
+        row.fail(merged_failures(policy_failures, sensing_failures))
         if self.fitted.stale:
             row.fail(dict.fromkeys(range(self._facts.count), STALE))
 
@@ -363,8 +373,10 @@ class Guard:
             return Outcome(response=response, decision=decision)
         robot.alarm = True
         robot.event = FAULT_EVENT
-        if set(evidence.terms) <= {CONTACT, SURPRISE} and not robot.over:
-            robot.event = KNOCK_EVENT  # which keeps the surprise under its threshold
+        only_felt = set(evidence.terms) <= {CONTACT, SURPRISE}
+        if only_felt and not robot.over:
+            # A contact and no fault: surprise is under its threshold, or a knock excuses it.
+            robot.event = KNOCK_EVENT
         return Outcome(evidence.terms, response, decision)
 
     def _evidence(self, index: int, row: JudgedRow) -> RowEvidence:
@@ -386,33 +398,37 @@ class Guard:
         if not evidence.alarm:
             return self._diagnostician.watch(evidence)
         reason = evidence.terms[0]
-        asked = self.terms.terms[reason].response
-        if asked != BY_CAUSE and self._graded:
-            return unexplained(asked, reason)
-        response, columns = self._diagnostician.prescribe(evidence)
-        # Complete the sensors that diagnosis blames: what is only missing is completed already.
-        # Then diagnosis begins anew, on the completed rows.
-        if columns.size or (response.name == "complete" and not evidence.only_lost):
-            if self._validator.suspect(evidence.index, columns):
-                self._diagnostician.close(evidence.index)
-            elif response.name == "complete":
-                return self._diagnostician.instead_of_completing(response)
+        response_of_term = self.terms.terms[reason].response
+        if response_of_term != BY_CAUSE and self._graded:
+            return unexplained(response_of_term, reason)
+
+        response, blamed_columns = self._diagnostician.prescribe(evidence)
+        completes = response.name == "complete"
+        blames_sensors = blamed_columns.size > 0 or (completes and not evidence.only_lost)
+        if not blames_sensors:  # numbers that are only missing are completed already
+            return response
+
+        is_completed = self._validator.suspect(evidence.index, blamed_columns)
+        if is_completed:
+            self._diagnostician.close(evidence.index)  # it begins anew, on the completed rows
+        elif completes:
+            return self._diagnostician.instead_of_completing(response)
         return response
 
     def _forget_evidence(self, row: JudgedRow) -> None:
-        """Let evidence begin anew where it was acted on, or is of rows not yet repaired."""
-        acted_on = self._nobody.copy()
+        """Clear a robot's evidence where it was acted on, or comes from rows that were not yet repaired."""
+        cleared_robots = self._nobody.copy()
         for robot, outcome in row.outcomes.items():
-            acted_on[robot] = outcome.decision.acted_on
+            cleared_robots[robot] = outcome.decision.acted_on
         for robot, repair in self._validator.repairs.items():
-            acted_on[robot] |= repair.settling > 0
-        acted_on &= self.table.records["active"]
-        if not acted_on.any():
+            cleared_robots[robot] |= repair.settling > 0  # rows before the repair still count
+        cleared_robots &= self.table.records["active"]
+        if not cleared_robots.any():
             return
-        failure = self._observer.forget(acted_on)
+        failure = self._observer.forget(cleared_robots)
         if failure:
-            forgetting = dict.fromkeys(np.flatnonzero(acted_on).tolist(), failure)
-            row.failures = merged_failures(row.failures, forgetting)
+            failures = dict.fromkeys(np.flatnonzero(cleared_robots).tolist(), failure)
+            row.failures = merged_failures(row.failures, failures)
 
     # ------------------------------------------------------------------ report
 
@@ -424,17 +440,21 @@ class Guard:
             self._commander.expect(self._observer.expected)
         if row.eventful or not self._limits.steady:
             records = self.table.records
-            policy = records["active"] & ~records["overridden"]
-            pressed = policy & records["presses"]
-            self._limits.follow(policy & (pressed | row.ends_step), pressed)
+            policy_acted = records["active"] & ~records["overridden"]
+            pressed = policy_acted & records["presses"]
+            # An arm that presses counts at once, any other at the end of its step.
+            counts = pressed
+            if row.ends_step:
+                counts = policy_acted
+            self._limits.follow(counts, pressed)
 
     def _report(self, row: JudgedRow) -> RowReport:
         """Return what became of the row; there is nothing to say of robots whose rows do not count."""
         robots = copied(self.table.records)
         if not self._all_active:
-            silent = ~robots["active"]
+            inactive = ~robots["active"]
             robots = robots.copy()
-            robots[silent] = cleared(robots[silent])
+            robots[inactive] = cleared(robots[inactive])
         if not row.eventful:
             return RowReport(robots, row.attribution)
         return RowReport(

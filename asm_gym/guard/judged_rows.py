@@ -300,8 +300,8 @@ def take_up_surprise(robot: Any, judged: Any, attribution: Any) -> None:
 @inner
 def count_quiet_row(robot: Any) -> None:
     """Count a row of the policy about which there is nothing to decide."""
-    robot.calm_rows += 1
-    robot.free_rows = 0
+    robot.low_surprise_rows += 1
+    robot.contact_free_rows = 0
     robot.rows_since_return += 1
     robot.policy_rows += 1
     robot.largest_surprise = max(robot.largest_surprise, robot.surprise)

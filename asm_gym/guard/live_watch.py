@@ -214,14 +214,14 @@ class LiveWatch(Adapter):
         """Say what is wrong with the line, the clock or the rate."""
         if row.problem and not self.rows and self._settings.reopen is None:
             raise ValueError(row.problem)
-        if row.problem and not row.read:
+        if row.problem and not row.read:  # the line is no row, or came too late
             self._count_unreadable(row.problem, arrival)
-        elif row.problem:
+        elif row.problem:  # the clock was set anew
             self._alarm(f"{row.problem}: an alarm, and a new beginning", CLOCK)
             self._begin()
-        elif row.change and row.read:
+        elif row.change and row.read:  # rows come at another rate, and can be judged
             self._note(row.change)
-        elif row.change:
+        elif row.change:  # they cannot
             self._alarm(f"{row.change}: they are not judged, an alarm", RATE)
             self._begin()
 
@@ -235,11 +235,13 @@ class LiveWatch(Adapter):
     def _pass_lost_rows(self, lost: int) -> None:
         """Go on over rows that did not come, as many as the bridge allows."""
         missing = np.full(self._spec.size, np.nan)
-        bridged = [self._bridge.goes_over(np.isnan(missing)) for _ in range(min(lost, MOST_LOST))]
+        asked = min(lost, MOST_LOST)
+        bridged = [self._bridge.goes_over(np.isnan(missing)) for _ in range(asked)]
         is_alarm = not all(bridged)
+        passed = asked
         if is_alarm:
-            del bridged[1:]
-        for _ in bridged:
+            passed = 1
+        for _ in range(passed):
             self._judge(missing, is_bridged=True)
 
         # A source that loses rows again and again is one alarm.
@@ -342,9 +344,10 @@ def _opened(reopen: Callable[[float], Iterator[str]], first_s: float) -> Iterabl
     """Return the lines of a source; None where it is not there, or sends none in ``first_s``."""
     try:
         lines = reopen(first_s)
-        return chain([next(filter(str.strip, lines))], lines)
+        first_line = next(filter(str.strip, lines))  # skips blank lines
     except (OSError, SourceDied, StopIteration):
         return None
+    return chain([first_line], lines)
 
 
 def counted(count: int, noun: str) -> str:

@@ -38,7 +38,7 @@ class ReleaseRule:
     """
 
     release_after: int = 10
-    """Calm rows after which control is handed back."""
+    """Rows of low surprise after which control is handed back."""
     max_override: float = math.inf
     """Rows of a reflex, those before a hand-back after which the alarm was soon back too."""
     try_after: float = math.inf

@@ -72,8 +72,8 @@ ROBOT = np.dtype(
         ("alarm", np.bool_),  # the row is an alarm, for whatever reason
         # Counters (``judged_rows`` where there is nothing to decide, else ``Arbiter``)
         ("state", np.int8),  # who acts next, an index in ``STATES``
-        ("calm_rows", np.int64),  # of low surprise, one after the other
-        ("free_rows", np.int64),  # of a reflex without a contact, one after the other
+        ("low_surprise_rows", np.int64),  # one after the other
+        ("contact_free_rows", np.int64),  # of a reflex without a contact, one after the other
         ("held_rows", np.int64),  # of a reflex since it took over
         # the same, those before a hand-back that came too early included
         ("override_rows", np.int64),

@@ -178,10 +178,11 @@ class CalibratedMonitor:
         if warm_start:
             about = {**self.about, "specialised_on": len(episodes), **about}
         new.about = about
-        vars(self).update(vars(new))
+        self._become(new)
         return self
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
+        """Learn from episodes, in place: anew, or on from what is learned with ``warm_start``."""
         self._uncalibrate()
         hashes = hashes_of(episodes)
         if warm_start and self.learned_from_ is not None:
@@ -198,15 +199,16 @@ class CalibratedMonitor:
             self._learn_anew(episodes, progress)
 
     def _learn_anew(self, episodes: Sequence[Episode], progress: Progress) -> None:
+        """Fit the model, and then each detection on the model's errors."""
         rng = np.random.default_rng(self.seed)
         learned, held_out = with_held_out(episodes, self.model.held_out, rng)
         self.model.fit(learned, rng, progress)
         self._place_errors()
         nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
         for detection in self.detections.values():
-            shared = self.model.learned_.keys() & set(detection.arrays)
-            if shared:
-                names = ", ".join(sorted(shared))
+            shared_names = self.model.learned_.keys() & set(detection.arrays)
+            if shared_names:
+                names = ", ".join(sorted(shared_names))
                 raise ValueError(f"{self.model.kind} and {detection.name} both learn {names}")
             detection.fit(nominal, rng)
         self.model.crossfitted = {}
@@ -260,23 +262,27 @@ class CalibratedMonitor:
                 f"got {len(each)} for {len(episodes)} episodes"
             )
         rate.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
-        new = self._copy()
-        for_ceilings: set[int] = set()
+        new = self._copy()  # an error leaves this one as it was
+        for_ceilings: set[int] = set()  # indices of episodes
         if isinstance(self.detection, EvidenceDetection):
             for_ceilings = ceiling_episodes(episodes, rate, each)
         if for_ceilings:
             check_fresh(episodes, self.learned_from_)
             new._set_ceilings([episodes[n] for n in sorted(for_ceilings)])
-        else:
+        else:  # earlier ceilings stay
             check_fresh(episodes, self.learned_from_, self.ceilings_from_)
 
         for_threshold = [e for n, e in enumerate(episodes) if n not in for_ceilings]
         groups = [group for n, group in enumerate(each) if n not in for_ceilings]
         new = new._balanced(for_threshold)
         new._set_threshold(for_threshold, rate, groups)
-        new._keep_limits(episodes)
-        vars(self).update(vars(new))
+        new._keep_healthy_ranges(episodes)
+        self._become(new)
         return self
+
+    def _become(self, new: Self) -> None:
+        """Take over everything from a copy that has learned or was calibrated."""
+        vars(self).update(vars(new))
 
     def _set_ceilings(self, episodes: Sequence[Episode]) -> None:
         """Set the ceilings of the detection by healthy episodes."""
@@ -295,7 +301,7 @@ class CalibratedMonitor:
         self.maxima_ = np.array([value.max() for value in values])
         self.blocks_ = Blocks.of(values, self.spec.dt, groups)
 
-    def _keep_limits(self, episodes: Sequence[Episode]) -> None:
+    def _keep_healthy_ranges(self, episodes: Sequence[Episode]) -> None:
         """Keep the forces, speeds, motion and commands of healthy episodes."""
         streams = [episode.stream for episode in episodes]
         self.healthy_ = healthy_forces(streams, self.spec)
@@ -330,7 +336,7 @@ class CalibratedMonitor:
         return Promise.of(self.maxima_, self.threshold)
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
-        """Return it, or a copy whose parts are weighed against each other by nominal episodes."""
+        """Return a copy that weighs several judgements against each other by nominal episodes; itself with just one."""
         return self
 
     @typed
@@ -356,10 +362,11 @@ class CalibratedMonitor:
         detection, attribution = self.detection.attribute_step(
             state.detection, output, rows, lambda shares: shares @ self._error_shares
         )
-        finite = np.isfinite(rows)
-        incomplete = ~finite.all(axis=1)
-        attribution[incomplete] = np.where(finite[incomplete], 0.0, np.inf)
-        return MonitorState(model, detection), Surprise(attribution.sum(axis=1), attribution)
+        is_finite = np.isfinite(rows)
+        incomplete = ~is_finite.all(axis=1)
+        attribution[incomplete] = np.where(is_finite[incomplete], 0.0, np.inf)
+        value = attribution.sum(axis=1)
+        return MonitorState(model, detection), Surprise(value, attribution)
 
     @typed
     def reset_evidence(self, state: MonitorState) -> MonitorState:
@@ -401,26 +408,28 @@ class CalibratedMonitor:
         """
         header = saved.header
         kept = read_monitor(saved)
-        self.with_learned(kept.learned, tuple(header["skills"]))
+        self.restore_learned(kept.learned, tuple(header["skills"]))
         vars(self).update(kept.attributes)
         if header["detection"] == self.detection.name:
             self.threshold_ = threshold_below(header["threshold"], self.detection.reach)
             vars(self).update(kept.calibration)
         return self
 
-    def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        """Take over the arrays that ``learned_`` gave, without a threshold, and return it."""
+    def restore_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        """Take over the arrays that ``learned_`` returned, in place and without a threshold; return the monitor."""
         require_arrays(arrays, self.detection.arrays)
         self._uncalibrate()
-        of_model = dict(arrays)
+        arrays_of_model = dict(arrays)
         for detection in self.detections.values():
             if arrays.keys() >= set(detection.arrays):
-                detection.restore({name: of_model.pop(name) for name in detection.arrays})
-        self.model.restore(of_model, skills)
+                own_arrays = {name: arrays_of_model.pop(name) for name in detection.arrays}
+                detection.restore(own_arrays)
+        self.model.restore(arrays_of_model, skills)
         self._place_errors()
         return self
 
     def _uncalibrate(self) -> None:
+        """Forget all that ``calibrate`` has set, but for ceilings."""
         self.threshold_ = None
         self.maxima_ = None
         self.blocks_ = None
@@ -448,9 +457,10 @@ class CalibratedMonitor:
         return other
 
     def _require_fitted(self) -> None:
+        """Raise NotFitted before ``fit``."""
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
             raise NotFitted(f"this {self._name}", "has learned nothing", "fit(episodes)")
 
     def _place_errors(self) -> None:
-        """Map errors to columns, once the model knows which columns it predicts."""
+        """Compute how each error is shared out to columns, once the model knows which it predicts."""
         self._error_shares = error_shares(self.model.error_columns, self.spec)

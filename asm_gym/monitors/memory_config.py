@@ -1,4 +1,4 @@
-"""Hyperparameters of a memory that seldom need a change."""
+"""Hyperparameters of a memory: the defaults of those that ``NeuralASM`` takes, and those that seldom need a change."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from asm_gym.detection.evidence import TAIL_INDEX
 from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.memory.dynamics import Dynamics
 from asm_gym.validation import check_number
+
+HIDDEN_UNITS = 256  # of the temporal network
+ASSOCIATION_UNITS = 480
+EPOCHS = 40
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a damaged file must not ask for a thousand million."""

@@ -73,20 +73,20 @@ class Surprise(NamedTuple):
         return silent._replace(raw=np.where(where, 0.0, self.raw))
 
     def without(self, columns: NDArray[np.bool_]) -> Surprise:
-        """Return what is left of it where the precision of ``columns`` (D,) is 0."""
+        """Return the surprise without the shares of ``columns`` (D,); a value that is not finite stays."""
         if not columns.any():
             return self
         has_share = np.isfinite(self.value) & (self.value > 0)
         of_columns = self.attribution[has_share][:, columns].sum(axis=1)
-        left = np.ones(len(self.value))
-        left[has_share] = np.clip(1.0 - of_columns / self.value[has_share], 0.0, 1.0)
+        share_left = np.ones(len(self.value))
+        share_left[has_share] = np.clip(1.0 - of_columns / self.value[has_share], 0.0, 1.0)
         rest = self._replace(
-            value=np.where(has_share, left * self.value, self.value),
+            value=np.where(has_share, share_left * self.value, self.value),
             attribution=np.where(columns, 0.0, self.attribution),
         )
         if self.raw is None:
             return rest
-        return rest._replace(raw=np.where(has_share, left * self.raw, self.raw))
+        return rest._replace(raw=np.where(has_share, share_left * self.raw, self.raw))
 
 
 class Monitor(Protocol):

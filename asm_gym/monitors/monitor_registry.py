@@ -92,8 +92,8 @@ def _rival(model: str, detection: str) -> MonitorKind:
 
 
 RIVALS = {
-    "logpzo": _rival("baselines.networks:LogpZO", "moving_mean"),
-    "gru": _rival("baselines.networks:GRU", "mahalanobis"),
+    "logpzo": _rival("baselines.torch_baselines:LogpZO", "moving_mean"),
+    "gru": _rival("baselines.torch_baselines:GRU", "mahalanobis"),
     "kalman": _rival("baselines.kalman:Kalman", "mahalanobis"),
     "association_linear": _rival("baselines.change_regression:LinearAssociation", "mahalanobis"),
     "association_values": _rival("torque.value_association:ValueAssociation", "largest"),

@@ -2,7 +2,7 @@
 
 row → memory: errors, context → whiten → accumulate → value, attribution
 
-Further functions take a memory as an argument: ``skills``, ``shipped``.
+Further functions take a memory as an argument: ``memory_skills``, ``shipped``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,13 @@ from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.memory_config import OF_EVIDENCE, MemoryConfig
+from asm_gym.monitors.memory_config import (
+    ASSOCIATION_UNITS,
+    EPOCHS,
+    HIDDEN_UNITS,
+    OF_EVIDENCE,
+    MemoryConfig,
+)
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor_files import restored
 from asm_gym.monitors.monitor_protocol import Progress, Surprise
@@ -48,7 +54,8 @@ class NeuralASM(CalibratedMonitor):
         association_size: hidden units of association, shared out among the groups of senses.
         epochs: passes of the temporal network over the training episodes; fewer if there are very many episodes.
         free_running_probability: probability that a training step continues from the prediction and the memory's own
-            action; reached halfway through training. Above 0 the memory learns recall (``skills.recall``, best at 0.6).
+            action; reached halfway through training. Above 0 the memory learns recall (``memory_skills.recall``, best
+            at 0.6).
         habituates: divide surprise by its usual size in a context. The context depends on the policy, so use False for
             a memory that watches any policy.
         dynamics: how the temporal network represents the past: ``"traces"`` of senses and actions, or ``"settling"``,
@@ -87,9 +94,9 @@ class NeuralASM(CalibratedMonitor):
     def __init__(
         self,
         spec: StreamSpec,
-        hidden_size: int = 256,
-        association_size: int = 480,
-        epochs: int = 40,
+        hidden_size: int = HIDDEN_UNITS,
+        association_size: int = ASSOCIATION_UNITS,
+        epochs: int = EPOCHS,
         free_running_probability: float = 0.0,
         habituates: bool = True,
         dynamics: str = TRACES,
@@ -124,8 +131,8 @@ class NeuralASM(CalibratedMonitor):
         ArmFeatures.of(spec, urdf)  # refuses a body model of another arm
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
-        of_evidence = {name: getattr(config, name) for name in OF_EVIDENCE}
-        evidence = EvidenceDetection(spec, habituates=habituates, **of_evidence)
+        evidence_params = {name: getattr(config, name) for name in OF_EVIDENCE}
+        evidence = EvidenceDetection(spec, habituates=habituates, **evidence_params)
         self.config = self.config.as_checked_by(evidence)
         self.habituates = evidence.habituates
         super().__init__(model, evidence, seed=seed)
@@ -136,7 +143,9 @@ class NeuralASM(CalibratedMonitor):
 
     def _param(self, name: str) -> Any:
         """Return a hyperparameter, of the memory or of its config."""
-        return getattr(self if hasattr(self, name) else self.config, name)
+        if hasattr(self, name):
+            return getattr(self, name)
+        return getattr(self.config, name)
 
     def get_params(self) -> dict[str, Any]:
         return {name: self._param(name) for name in parameter_names(type(self))}
@@ -203,6 +212,7 @@ class NeuralASM(CalibratedMonitor):
             new = new._replace(excuses=state.excuses)
             divisor = np.ones(len(rows))
         else:
+            # divisor (B,): by it knocks and stops have divided the surprise
             new, surprise, divisor = kernel(state, rows, out)
 
         if self.values_ is not None:
@@ -231,8 +241,8 @@ class NeuralASM(CalibratedMonitor):
         other._uncalibrate()
         return other
 
-    def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        super().with_learned(without_values(arrays), skills)
+    def restore_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        super().restore_learned(without_values(arrays), skills)
         self.values_ = ValueJudge.restored(self.spec, arrays, self.seed, self.urdf)
         return self
 
@@ -246,6 +256,7 @@ class NeuralASM(CalibratedMonitor):
         return self._kernel
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
+        """Return a copy in which values weigh as much as changes, by nominal episodes."""
         if self.values_ is None:
             return self
         other = self._copy()

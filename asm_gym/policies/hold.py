@@ -22,12 +22,12 @@ from gymnasium.vector import VectorActionWrapper, VectorEnv
 from gymnasium.wrappers import ClipAction, TransformAction
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import DELTA, MEANINGS, TARGET, VELOCITY, ActionMeaning
+from asm_gym.data.action_meaning import DELTA, TARGET, VELOCITY, ActionMeaning
 from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.stream_source import layers
 
 SAFE_ACTION = "use Hold(env, safe_action=...)"
-KNOWN_TO_STAY = MEANINGS[:3]  # meanings under which some action makes a robot stay
+KNOWN_TO_STAY = (DELTA, TARGET, VELOCITY)  # meanings under which some action makes a robot stay
 
 
 @runtime_checkable
@@ -65,21 +65,21 @@ class Hold:
         if not isinstance(space, spaces.Box):
             raise TypeError(f"a reflex needs a Box action space, got {space}")
 
-        robot = env.unwrapped
+        innermost = env.unwrapped
         self.env = env  # a guard refuses a policy that was made for another environment
         self.explicit = safe_action is not None  # such a policy is bound to no environment
         self._robot: HoldsItself | None = None
         if safe_action is not None:
             self._rest = np.array(safe_action, np.float32)
-        elif isinstance(robot, HoldsItself):
-            self._robot = robot
+        elif isinstance(innermost, HoldsItself):
+            self._robot = innermost
             self._rest = nearest_to_zero(space)
         else:
             self._rest = _rest_by_attribute(env)
 
         if not space.contains(self._rest):
             raise ValueError(f"safe_action {self._rest} is not in {space}")
-        self._grip = gripper_columns(getattr(robot, "gripper_actions", ()), self._rest.size)
+        self._grip = gripper_columns(getattr(innermost, "gripper_actions", ()), self._rest.size)
 
     def begin(self, executed: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the initial state after the action ``executed`` (A,), whose grip is kept."""
@@ -124,7 +124,7 @@ class HoldingActions:
         self.executed = np.tile(rest, (count, 1))  # (n, A) the last action before the override
         self._actions = np.full_like(self.executed, np.nan)  # (n, A) NaN: not yet known
         # (2, n, D) the newest finite value of each number of a row, now and a row earlier
-        self._rows: NDArray[np.float32] = np.zeros((2, count, 0), np.float32)
+        self._rows: NDArray[np.float32] = np.zeros((2, count, 0), np.float32)  # D = 0: none sensed
 
     def begin(self, which: NDArray[np.bool_]) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
@@ -195,9 +195,11 @@ def staying(
         return Staying(resting_action(env))
 
     changed = why_changed(env, "a reflex")
-    moves_at_rest = np.any(zero.ravel()[np.array(declared.means) != TARGET])
-    if changed or moves_at_rest:
-        raise UnsupportedEnvironment(changed or _no_rest(space))
+    if changed:
+        raise UnsupportedEnvironment(changed)
+    is_no_target = np.array(declared.means) != TARGET
+    if np.any(zero.ravel()[is_no_target]):  # the space does not contain zero
+        raise UnsupportedEnvironment(_no_rest(space))
     if has_target:
         return Staying(zero, declared)
     return Staying(zero)
@@ -207,7 +209,8 @@ def _warn_of_contradictions(declared: ActionMeaning, recorded: ActionMeaning) ->
     """Warn of numbers that are declared a target and move as none, or the other way round."""
     contradictions = []
     for number, (own, measured) in enumerate(zip(declared.means, recorded.means, strict=True)):
-        if own != measured and TARGET in (own, measured) and measured in KNOWN_TO_STAY:
+        differs = own != measured and TARGET in (own, measured)
+        if differs and measured in KNOWN_TO_STAY:
             contradictions.append(f"number {number} moves as a {measured}")
     if contradictions:
         message = "; ".join(contradictions)
@@ -247,15 +250,17 @@ def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
         UnsupportedEnvironment: none is known.
     """
     space: Any = env.action_space
-    bounded = np.isfinite(space.low) & np.isfinite(space.high)
-    middle = 0.5 * np.add(space.low, space.high, out=np.zeros(space.shape), where=bounded)
+    is_bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    low_plus_high = np.zeros(space.shape)  # 0 without bounds
+    np.add(space.low, space.high, out=low_plus_high, where=is_bounded)
+    middle = 0.5 * low_plus_high
     for candidate in (nearest_to_zero(space), middle.astype(np.float32)):
-        if not np.any(_innermost(env, candidate)):
+        if not np.any(_innermost_action(env, candidate)):
             return candidate
     raise UnsupportedEnvironment(why_changed(env, "hold") or _no_rest(space))
 
 
-def _innermost(env: gym.Env[Any, Any], action: NDArray[np.float32]) -> NDArray[np.float32]:
+def _innermost_action(env: gym.Env[Any, Any], action: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return what an action (A,) becomes on its way to the innermost environment.
 
     Raises:

@@ -16,7 +16,7 @@ from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.stack import StackExpert
-from asm_gym.policies.scripted.sway import Arm, Swaying
+from asm_gym.policies.scripted.sway import Swaying, SyntheticArmExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
 from asm_gym.tasks import TaskSpec
@@ -43,7 +43,7 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 
 def scripted(env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
     """Return the expert of an environment's task; raise ValueError where there is none."""
-    experts = EXPERTS | {"asm_gym/SyntheticArm-v0": Arm}
+    experts = EXPERTS | {"asm_gym/SyntheticArm-v0": SyntheticArmExpert}
     task = getattr(env.unwrapped, "task", None)
     name = ""
     if isinstance(task, TaskSpec):
@@ -135,13 +135,16 @@ def make_policy(
     """
     if name in POLICIES:
         return POLICIES[name](env, seed=seed, **kwargs)
+    # ``target`` imports what only some policies need.
     if name.endswith(".zip"):
         algorithm, _, file = name.partition(":")
         check_choice("algorithm", algorithm, ALGORITHMS)
-        return cast(Policy, target(f"stable_baselines3:{algorithm}").load(file, env, device="cpu"))
+        algorithm_class = target(f"stable_baselines3:{algorithm}")
+        return cast(Policy, algorithm_class.load(file, env, device="cpu"))
     if name.endswith(".asm"):
         memory: Any = target("asm_gym.monitors:NeuralASM").load(name)
-        return cast(Policy, target("asm_gym.monitors.memory_policy:NeuralASMPolicy")(memory, env))
+        policy_class = target("asm_gym.monitors.memory_policy:NeuralASMPolicy")
+        return cast(Policy, policy_class(memory, env))
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
     known = ", ".join((*POLICIES, *agents()))

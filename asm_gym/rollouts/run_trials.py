@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -40,7 +40,7 @@ from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
 from asm_gym.wrappers.faults import FaultInjection
 
-Item = TypeVar("Item")
+UNUSED_STAGE = 99  # stage of the random draws whose seeds no recorded episode has
 
 
 class Cached(NamedTuple):
@@ -69,39 +69,43 @@ def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
 
 
 def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tuple[Fault, ...]:
-    """Return what goes wrong in ``env``.
+    """Return the faults of a trial in ``env``; none for a nominal one.
 
-    Outside of robosuite, magnitudes are relative to how far senses move in three nominal episodes as of ``config``.
+    Outside of robosuite, magnitudes are relative to how far the senses move in nominal episodes with ``config``.
     """
     if trial.faults is not None:
         return trial.faults
     if trial.kind == NOMINAL:
         return ()
     arm: Any = env.unwrapped
-    onset = trial.begins(env)
+    onset = trial.onset_in(env)
     if not isinstance(arm, RobosuiteEnv):
         arguments = (trial.env_id, config)
-        sigma = _cached("sigmas", arguments, lambda: _sigmas(trial.env_id, config))
+        spreads = _cached("spreads", arguments, lambda: _nominal_spreads(trial.env_id, config))
         interface = FaultyInterface(env)
-        return faults_anywhere(trial.kind, interface, sigma, trial.severity, onset, trial.seed)
-    if trial.kind != PASSING:
-        return (suite_fault(trial.kind, arm, trial.severity, onset, trial.seed),)
-    drawn = draw(arm, onset, trial.seed)
-    push = Push(
+        return faults_anywhere(trial.kind, interface, spreads, trial.severity, onset, trial.seed)
+    if trial.kind == PASSING:
+        return (_passing_push(arm, onset, trial.seed, control_period(env)),)
+    return (suite_fault(trial.kind, arm, trial.severity, onset, trial.seed),)
+
+
+def _passing_push(arm: RobosuiteEnv, onset: int, seed: int, dt: float) -> Push:
+    """Return the push of kind ``PASSING``, in an environment with a control period of ``dt`` [s]."""
+    drawn = draw(arm, onset, seed)
+    return Push(
         body=drawn.link,
         newtons=20.0,
         direction=drawn.direction,
-        duration=max(1, round(0.3 / control_period(env))),
+        duration=max(1, round(0.3 / dt)),
         onset=onset,
     )
-    return (push,)
 
 
-def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
-    """Return the spread of each sense in nominal episodes of seeds that no role has."""
+def _nominal_spreads(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
+    """Return the spread of each sense in three nominal episodes that are not recorded otherwise."""
     env = StreamRecorder(environment(env_id, config.settings))
     streams = []
-    for seed in episode_seeds(0, 3, stage=99):
+    for seed in episode_seeds(0, 3, UNUSED_STAGE):
         play(Trial(env_id, seed), config, env)
         streams.append(env.finish().stream[:, env.stream_spec.sensory])
     return sigmas(FaultyInterface(env.env), streams)
@@ -134,10 +138,11 @@ def play(
 
 
 def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Policy:
-    """Return the policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
+    """Return the policy for one episode; seed it if it has ``set_random_seed``, as stable-baselines3's have."""
     if isinstance(source, str | Path):
         return make_policy(str(source), env, seed=seed)
     policy: Any = source
+    # A factory: a function, or a class, which has ``predict`` as its instances do.
     if isinstance(source, type) or not isinstance(source, Policy):
         policy = source(env)
     if hasattr(policy, "set_random_seed"):
@@ -155,7 +160,7 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
         play(trial, config, recorder, note_force)
-    if np.isnan(forces).all():
+    if np.isnan(forces).all():  # the environment does not measure them
         forces.clear()
     recorded = recorder.finish()
     return Episode(
@@ -191,28 +196,14 @@ def record_missing(
 ) -> list[Path]:
     """Record the trials that are not in ``folder`` yet; return the files of all."""
     folder = folder.resolve()
-    return _record_missing(
-        trials,
-        lambda trial: record_stream(trial, config),
-        lambda trial: folder / trial.label.path,
-        workers,
-        progress,
-    )
 
+    def file_of(trial: Trial) -> Path:
+        return folder / trial.label.path
 
-def _record_missing(
-    items: Sequence[Item],
-    record: Callable[[Item], Episode],
-    file_of: Callable[[Item], Path],
-    workers: int,
-    progress: Progress | None,
-) -> list[Path]:
-    """Record the items without a file; return the files of all."""
+    def record(trial: Trial) -> Path:
+        return save_episode(file_of(trial), record_stream(trial, config))
 
-    def make(item: Item) -> Path:
-        return save_episode(file_of(item), record(item))
-
-    return make_missing(make, items, file_of, workers, progress)
+    return make_missing(record, trials, file_of, workers, progress)
 
 
 @typed
@@ -282,17 +273,18 @@ def collect_to(
     """Record the episodes that are not in ``folder`` yet; return the files of all."""
     folder = folder.resolve()
     spec = env_spec(env_id)
-    return _record_missing(
-        seeds,
-        lambda seed: record_episode(seed, spec, config),
-        lambda seed: folder / f"{seed}.npz",
-        workers,
-        progress,
-    )
+
+    def file_of(seed: int) -> Path:
+        return folder / f"{seed}.npz"
+
+    def record(seed: int) -> Path:
+        return save_episode(file_of(seed), record_episode(seed, spec, config))
+
+    return make_missing(record, seeds, file_of, workers, progress)
 
 
-def check(env_id: str, config: RolloutConfig) -> None:
-    """Raise what the environment and the policy refuse, before anything runs."""
+def check_config(env_id: str, config: RolloutConfig) -> None:
+    """Make the environment and the policy once, so that what they refuse is raised before anything runs."""
     policy_for(config.policy, StreamRecorder(environment(env_id, config.settings)), seed=0)
 
 
@@ -301,7 +293,7 @@ def check(env_id: str, config: RolloutConfig) -> None:
 
 @lru_cache(maxsize=1)
 def _memory(path: Path, written_ns: int) -> NeuralASM:
-    """Load once a process, and again when the file has changed."""
+    """Load a memory; the last one is cached until its file is ``written_ns`` anew."""
     return NeuralASM.load(path)
 
 
@@ -312,22 +304,23 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     with staged(trial, config) as env:
         guarded = NeuralASMSafety(env, monitor, on_alarm=cast(OnAlarmName, trial.on_alarm))
         success = play(trial, config, guarded, infos.append)
-    reports = [info["asm"] for info in infos]  # of each control step
-    rows = len(reports[0]["surprises"])  # of each control step
-    fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
+    reports = [info["asm"] for info in infos]  # one a control step
+    rows_per_step = len(reports[0]["surprises"])
+    is_faulty = [bool(info.get("fault")) for info in infos]
+    fault = np.repeat(is_faulty, rows_per_step)  # (T,)
     onset = None
     if fault.any():
         onset = int(np.argmax(fault))
-    time = math.nan
+    time_to_success = math.nan
     solved_steps = [step for step, info in enumerate(infos) if info["success"]]
     if solved_steps:
-        time = (solved_steps[0] + 1) * rows * monitor.spec.dt
+        time_to_success = (solved_steps[0] + 1) * rows_per_step * monitor.spec.dt
     forces = [info.get("contact_force", np.nan) for info in infos]
     outcome = InterventionOutcome(
         success=success,
         contact_force=float(np.max(forces)),
         overridden=any(info["overridden"] for info in infos),
-        time=time,
+        time=time_to_success,
     )
     trace = ScoredEpisode(
         kind=trial.kind,
@@ -344,7 +337,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     )
     # A control step reports the shares of its most surprising row.
     shares = [list(report["attribution"].values()) for report in reports]
-    attribution = np.repeat(shares, rows, axis=0)  # (T, D)
+    attribution = np.repeat(shares, rows_per_step, axis=0)  # (T, D)
     return trace.attributed(attribution, monitor.spec.labels)
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from asm_gym.data.episode import spans
+from asm_gym.readings import spans
 
 
 class GuardedStep(NamedTuple):

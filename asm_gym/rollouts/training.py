@@ -37,7 +37,7 @@ CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
 BATCH = 256  # steps of an update of cloning
 LOG_STD = -3.5  # the actor's log standard deviation before tanh, after cloning
 CLONING_RATE = 1e-3  # learning rate of cloning
-ANCHOR_RATE = 3e-4  # the same while the agent learns from its steps
+LATER_CLONING_RATE = 3e-4  # the same while the agent learns from its own steps
 
 Floats = NDArray[np.float32]
 
@@ -81,7 +81,7 @@ class NormalisedCritic(SACPolicy):
             layers = torch.nn.Sequential()
             for layer in network:
                 layers.append(layer)
-                if getattr(layer, "out_features", 1) > 1:
+                if getattr(layer, "out_features", 1) > 1:  # a hidden layer
                     layers.append(torch.nn.LayerNorm(layer.out_features))
             critic.q_networks[n] = layers
             critic.add_module(f"qf{n}", layers)
@@ -97,14 +97,20 @@ class GuardedSAC(SAC):
             group["lr"] *= ACTOR_SHARE
 
     def _store_transition(
-        self, buffer: Any, action: Any, seen: Any, reward: Any, dones: Any, infos: Any
+        self,
+        buffer: Any,
+        action: Any,
+        next_observation: Any,
+        reward: Any,
+        dones: Any,
+        infos: Any,
     ) -> None:
         executed = np.array(action)
         for n, info in enumerate(infos):
             override = info.get("asm", {}).get("executed_action")
             if override is not None:
                 executed[n] = self.policy.scale_action(override)
-        super()._store_transition(buffer, executed, seen, reward, dones, infos)
+        super()._store_transition(buffer, executed, next_observation, reward, dones, infos)
 
 
 def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:
@@ -124,19 +130,22 @@ def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:
 
 
 def train(
-    make: Callable[[], gym.Env[Any, Any]],
+    make_env: Callable[[], gym.Env[Any, Any]],
     out: Path,
     demonstrations: Sequence[Episode],
     settings: TrainingSettings,
     progress: Progress,
 ) -> NetworkPolicy:
-    """Return the best agent of the evaluations; without any of them, the last one. ``make`` makes the environment.
+    """Return the agent that did best in the evaluations; the last one if there were none.
+
+    Logs and the best model are kept in the folder ``out``.
 
     Raises:
         TypeError: spaces other than Boxes with one axis.
         ValueError: demonstrations of other sizes.
     """
-    with closing(make()) as env, closing(make()) as other:  # the learner's own must not be reset
+    # Evaluations have an environment of their own, as they would reset the learner's amid an episode.
+    with closing(make_env()) as env, closing(make_env()) as evaluation_env:
         check_sizes(env, demonstrations)
         observations = np.concatenate([e.observations for e in demonstrations])
         mean = observations.mean(axis=0)
@@ -150,13 +159,14 @@ def train(
         learner = make_learner(Monitor(view), settings.seed)
         learner.set_logger(configure(str(out / "log"), formats))
         fill_buffer(learner, demonstrations, view)
-        anchor = clone(learner, settings.cloning_updates, settings.seed, progress)
+        cloning_update = clone(learner, settings.cloning_updates, settings.seed, progress)
         if settings.steps:
+            # Critics learn the value of the clone first, while the actor stays as it is.
             learner.actor.requires_grad_(False)
             learner.train(min(CRITIC_UPDATES, settings.cloning_updates), BATCH)
             learner.actor.requires_grad_(True)
             evaluations = EvalCallback(
-                Monitor(Standardised(other, mean, scale)),
+                Monitor(Standardised(evaluation_env, mean, scale)),
                 n_eval_episodes=settings.evaluation_episodes,
                 eval_freq=settings.evaluate_every,
                 log_path=str(out / "log"),
@@ -166,13 +176,14 @@ def train(
             evaluations.eval_env.seed(settings.seed + 1)
 
             def after_step(variables: dict[str, Any], _: Any) -> bool:
-                anchor()
+                cloning_update()
                 done = variables["self"].num_timesteps
                 progress(min(done, settings.steps), settings.steps)
                 return True
 
             learner.learn(settings.steps, [evaluations, ConvertCallback(after_step)])
-        if settings.steps >= settings.evaluate_every:
+        was_evaluated = settings.steps >= settings.evaluate_every
+        if was_evaluated:
             learner.set_parameters(str(out / "best_model.zip"))
         return export(learner, view)
 
@@ -194,7 +205,7 @@ def check_sizes(env: gym.Env[Any, Any], demonstrations: Sequence[Episode]) -> No
 
 
 def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -> None:
-    """Add episodes to a learner's replay buffer, as its own are."""
+    """Add episodes to a learner's replay buffer, as if the learner had acted in them."""
     assert learner.replay_buffer is not None
     space: Any = learner.action_space
     for episode in episodes:
@@ -216,42 +227,43 @@ def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -
 def clone(
     learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda *_: None
 ) -> Callable[[], None]:
-    """Fit a learner's actor to the actions in its replay buffer; return a function that makes one update more."""
+    """Fit a learner's actor to the actions in its replay buffer; return a function that makes one more update."""
     buffer = learner.replay_buffer
     actor = learner.actor
     assert buffer is not None
     observations = torch.as_tensor(buffer.observations[: buffer.size(), 0].copy())
     actions = torch.as_tensor(buffer.actions[: buffer.size(), 0].copy())
-    head: Any = actor.log_std
+    log_std_layer: Any = actor.log_std
     with torch.no_grad():
-        head.weight.zero_()
-        head.bias.fill_(LOG_STD)
+        log_std_layer.weight.zero_()
+        log_std_layer.bias.fill_(LOG_STD)
     weights = [w for name, w in actor.named_parameters() if "log_std" not in name]
     optimiser = torch.optim.Adam(weights, lr=CLONING_RATE)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
-    batches = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
 
     def update() -> None:
-        drawn = torch.randint(len(actions), (BATCH,), generator=batches)
-        mean = torch.tanh(actor.get_action_dist_params(observations[drawn])[0])
+        batch = torch.randint(len(actions), (BATCH,), generator=generator)
+        mean = torch.tanh(actor.get_action_dist_params(observations[batch])[0])
         optimiser.zero_grad()
-        ((mean - actions[drawn]) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+        ((mean - actions[batch]) ** 2).mean().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
 
     for n in range(updates):
         update()
         decay.step()
         progress(n + 1, updates)
-    optimiser.param_groups[0]["lr"] = ANCHOR_RATE
+    optimiser.param_groups[0]["lr"] = LATER_CLONING_RATE
     return update
 
 
 def export(learner: SAC, view: Standardised) -> NetworkPolicy:
-    """Return the learner's policy for unstandardised observations, without its noise, to act in the environment."""
+    """Return the learner's policy without noise; it takes observations that are not standardised."""
     layers = []
     for part in (*learner.actor.latent_pi, learner.actor.mu):
         if isinstance(part, torch.nn.Linear):
-            weights, bias = (p.detach().cpu().numpy().copy() for p in (part.weight, part.bias))
+            weights = part.weight.detach().cpu().numpy().copy()
+            bias = part.bias.detach().cpu().numpy().copy()
             layers.append((weights, bias))
     policy = NetworkPolicy(layers, mean=view.mean, scale=view.scale, trained_in=describe(view.env))
     return policy.fit_to(view.env, "the agent")

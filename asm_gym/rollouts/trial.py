@@ -31,12 +31,12 @@ AFTER_S = 2.0  # how long a faulty episode is recorded after its onset [s]
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """How the episodes of a run are made: the arm is the task's own, and a stream row a control step, by default."""
+    """How the episodes of a run are made."""
 
     policy: PolicySource = "scripted"
-    robot: str | None = None
-    stream_freq: int | None = None
-    env_kwargs: Settings = ()
+    robot: str | None = None  # by default the arm of the task
+    stream_freq: int | None = None  # rows a second [Hz]; by default one a control step
+    env_kwargs: Settings = ()  # further arguments of ``gym.make``
 
     @property
     def settings(self) -> Settings:
@@ -52,14 +52,14 @@ class Trial:
 
     env_id: str
     seed: int  # of the environment and of the policy: trials that share it are twins
-    # or ``"passing_push"``, or a fault of the suite of this ``severity``; with ``faults``, a name
+    # ``NOMINAL``, ``PASSING``, or a kind of the suite; with ``faults`` it only names them
     kind: str = NOMINAL
     severity: str = ""
     # [steps]; by default drawn from the seed, in the first half of the episode
     onset: int | None = None
     faults: tuple[Fault, ...] | None = None
-    acting: str = POLICY_ALONE  # or a value of ``on_alarm``
-    # the episode ends so long after the onset [s]; by default it runs to its end
+    acting: str = POLICY_ALONE  # or the response to an alarm, a value of ``on_alarm``
+    # how long the episode goes on after the onset [s]; by default to its end
     after_s: float | None = None
     role: str = "nominal"  # or ``"fit"``, ``"calibration"``, ``"faulty"``, ``"babble"``
 
@@ -90,8 +90,8 @@ class Trial:
             return "monitor"
         return self.acting
 
-    def begins(self, env: gym.Env[Any, Any]) -> int:
-        """Return the onset in ``env`` [steps]."""
+    def onset_in(self, env: gym.Env[Any, Any]) -> int:
+        """Return the first control step with the fault, in ``env``."""
         if self.onset is not None:
             return self.onset
         if self.faults:
@@ -99,10 +99,10 @@ class Trial:
         return draw_onset(self.seed, horizon_of(env))
 
     def steps_in(self, env: gym.Env[Any, Any]) -> int | None:
-        """Return the last step that is run; None for the end of the episode."""
+        """Return how many control steps are run in ``env``; None for all of the episode."""
         if self.after_s is None:
             return None
-        return self.begins(env) + round(self.after_s / control_period(env))
+        return self.onset_in(env) + round(self.after_s / control_period(env))
 
 
 def task_in(env_id: str) -> str:
@@ -130,12 +130,13 @@ def horizon_of(env: gym.Env[Any, Any]) -> int:
 
 
 def kinds_in(env: gym.Env[Any, Any], faults: Sequence[str]) -> list[str]:
-    """Return the kinds of fault that are possible in ``env``; all for none."""
+    """Return those of the kinds ``faults`` that are possible in ``env``; of all kinds if it is empty."""
     inner = env.unwrapped
     if not isinstance(inner, RobosuiteEnv):
-        FaultyInterface(env)  # refuses spaces that no fault can act on
+        FaultyInterface(env)  # raises TypeError for spaces that no fault can act on
         return list(faults or foreign_faults.KINDS)
-    return [k for k in kinds_of(faults or tuple(KINDS)) if possible(k, inner)]
+    kinds = kinds_of(faults or tuple(KINDS))
+    return [kind for kind in kinds if possible(kind, inner)]
 
 
 def evaluation_trials(
@@ -149,7 +150,7 @@ def evaluation_trials(
 ) -> list[Trial]:
     """Return nominal episodes of a task by role, and faulty twins of some; raise ValueError for an unfit policy."""
     with closing(gym.make(env_id, **dict(config.settings))) as env:
-        make_policy(str(config.policy), env, seed=0)
+        make_policy(str(config.policy), env, seed=0)  # raises ValueError if it does not fit
         kinds = kinds_in(env, faults)
         horizon = horizon_of(env)
     roles = ("fit", "calibration", "nominal")

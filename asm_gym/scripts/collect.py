@@ -17,7 +17,7 @@ from asm_gym.data.episode import load_episode
 from asm_gym.data.minari_datasets import require_minari, write_dataset
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
-from asm_gym.rollouts.run_trials import check, collect_to
+from asm_gym.rollouts.run_trials import check_config, collect_to
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, task_in
 from asm_gym.scripts.command import Options, option, run
@@ -58,7 +58,7 @@ def collect(args: Args, console: Console) -> None:
     config = RolloutConfig(args.policy, args.robot)
     settings = dict(config.settings)
     name = dataset_id(args.task, args.policy)
-    check(task, config)
+    check_config(task, config)
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
         with stage("recording", console) as progress:

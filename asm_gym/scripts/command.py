@@ -41,8 +41,8 @@ REFUSED = 2
 # errors that a user can put right
 USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
 MOST_NAMES = 7  # that the help of an option lists; a wrong name lists all
-_SAME: Any = object()
-_ANNOTATED: Any = Annotated
+_NO_QUICK_VALUE: Any = object()  # with ``--quick`` the option keeps its default
+_ANNOTATED: Any = Annotated  # so that mypy lets annotations be computed
 
 
 class Terminated(KeyboardInterrupt):
@@ -55,7 +55,7 @@ class Terminated(KeyboardInterrupt):
 def option(
     default: T = MISSING,  # type: ignore[assignment]
     *,
-    quick: T = _SAME,  # default with ``--quick``
+    quick: T = _NO_QUICK_VALUE,  # default with ``--quick``
     least: float | None = None,  # lowest number, or the least length of a tuple
     # names that the help lists; no others are accepted, unless ``check`` decides
     known: Iterable[str] = (),
@@ -81,19 +81,20 @@ class Checked:
     """Options that are checked when they are made: ValueError where one is too small or an unknown name."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for own in fields(self):
+            value = getattr(self, own.name)
             if value is None:
                 continue
-            _check_least(each, value)
-            check = each.metadata.get("check")
-            known = each.metadata.get("known")
+            _check_least(own, value)
+            check = own.metadata.get("check")
+            known = own.metadata.get("known")
+            in_words = own.name.removesuffix("s").replace("_", " ")
             elements = value if isinstance(value, tuple) else (value,)
             for element in elements:
                 if check:
                     check(element)
                 elif known:
-                    check_choice(each.name.removesuffix("s").replace("_", " "), element, known)
+                    check_choice(in_words, element, known)
 
 
 def _check_least(option: Field[Any], value: Any) -> None:
@@ -129,62 +130,69 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
     import tyro
 
     args = list(sys.argv[1:] if argv is None else argv)
-    text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
-    named = [each for each in fields(cast(Any, kind)) if not each.metadata.get("positional")]
-    options = ["--" + each.name.replace("_", "-") for each in named] + ["--help"]
+    description = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
+    all_fields = fields(cast(Any, kind))
+    named = [each.name for each in all_fields if not each.metadata.get("positional")]
+    options = ["--" + field_name.replace("_", "-") for field_name in named] + ["--help"]
     for word in args:
         if word.startswith("--") and not word.startswith("--tyro-"):
-            check_choice("option", word.partition("=")[0].replace("_", "-"), options)
-    typed = tyro.cli(
-        _readable(kind, "--quick" in args),
+            option_name, _, _ = word.partition("=")
+            check_choice("option", option_name.replace("_", "-"), options)
+    unchecked = tyro.cli(
+        _unchecked(kind, "--quick" in args),
         args=args,
         prog=f"asm-gym {name}",
-        description=text,
+        description=description,
         config=(tyro.conf.FlagCreatePairsOff,),
     )
-    return kind(**vars(typed))
+    return kind(**vars(unchecked))
 
 
-def _readable(kind: type[Any], quick: bool) -> Any:
+def _unchecked(kind: type[Any], quick: bool) -> Any:
     """Return a subclass of ``kind`` that tyro reads: annotated, and not checked while it is read."""
     import tyro
 
     hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
-    marks: Any = tyro.conf
+    conf: Any = tyro.conf
     annotated: list[Any] = []
     for each in fields(kind):
         about = each.metadata
-        shown = marks.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
-        hint = _ANNOTATED[hints[each.name], shown]
+        in_help = conf.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
+        hint = _ANNOTATED[hints[each.name], in_help]
         if about.get("positional"):
-            hint = marks.Positional[hint]
+            hint = conf.Positional[hint]
         default = each.default
-        if quick and about.get("quick", _SAME) is not _SAME:
+        if quick and about.get("quick", _NO_QUICK_VALUE) is not _NO_QUICK_VALUE:
             default = about["quick"]
         elif default is MISSING:
             default = tyro.MISSING
         annotated.append((each.name, hint, field(default=default)))
-    unchecked = {"__post_init__": lambda self: None}
-    return make_dataclass(kind.__name__, annotated, bases=(kind,), frozen=True, namespace=unchecked)
+    no_checks = {"__post_init__": lambda self: None}
+    return make_dataclass(kind.__name__, annotated, bases=(kind,), frozen=True, namespace=no_checks)
 
 
 def _hint(about: Any) -> Callable[[str], str]:
-    """Return what the help says after an option's text: known names, its default and its quick value."""
+    """Return the function from an option's default to what the help says after the option's text.
+
+    ``about`` is the metadata of the option's field.
+    """
 
     def hint(default: str) -> str:
         parts = []
         names = list(about.get("known", ()))
         if names:
             listed = ", ".join(names[:MOST_NAMES])
-            parts.append(f"known: {listed}" + ", …" * (len(names) > MOST_NAMES))
+            if len(names) > MOST_NAMES:
+                listed += ", …"
+            parts.append(f"known: {listed}")
         if default == "(required)":
             parts.append("required")
         elif default not in ("", "None", "True", "False"):
             parts.append(f"default: {default}")
-        quick = about.get("quick", _SAME)
+        quick = about.get("quick", _NO_QUICK_VALUE)
         if isinstance(quick, tuple):
             quick = " ".join(map(str, quick))
-        if quick is not _SAME:
+        if quick is not _NO_QUICK_VALUE:
             parts.append(f"--quick: {quick}")
         if not parts:
             return ""
@@ -212,7 +220,7 @@ def run(
 
 
 def exit_code(name: str, work: Callable[[], int | None]) -> int:
-    """Return the exit code of ``work``; print an error that a user can put right as one line."""
+    """Return the exit code of ``work``; print an error that a user can correct as one line."""
     prog = f"asm-gym {name}".strip()
     try:
         with _terminable():
@@ -221,7 +229,9 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
         return int(end.code or DONE)
     except KeyboardInterrupt as end:
         print(f"{prog}: interrupted", file=sys.stderr)
-        return 128 + (signal.SIGTERM if isinstance(end, Terminated) else signal.SIGINT)
+        if isinstance(end, Terminated):
+            return 128 + signal.SIGTERM
+        return 128 + signal.SIGINT
     except BrokenPipeError:  # the reader of our output has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
@@ -245,24 +255,26 @@ def one_line(error: BaseException) -> str:
     """Return the message of an error as one line."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    head, *rest = [line.strip() for line in str(error).splitlines() if line.strip()] or [
-        type(error).__name__
-    ]
-    return f"{head} {'; '.join(rest)}".strip()
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    if not lines:
+        return type(error).__name__
+    first, *others = lines
+    return f"{first} {'; '.join(others)}".strip()
 
 
 @contextmanager
 def _terminable() -> Iterator[None]:
     """Turn SIGTERM into an exception, as Ctrl-C is, so that workers are stopped; restore the caller's handler."""
 
-    def end(number: int, frame: object) -> None:
+    def raise_terminated(number: int, frame: object) -> None:
         raise Terminated
 
-    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
+    # Signals reach the main thread only.
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, end)
+    callers_handler = signal.signal(signal.SIGTERM, raise_terminated)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, callers_handler)

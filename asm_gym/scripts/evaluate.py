@@ -200,7 +200,7 @@ def evaluate(args: Args, console: Console) -> None:
                 rate=args.false_alarm_rate,
                 window_s=WINDOW_S,
                 seed=args.seed,
-                each=partial(parallel_map, workers=args.workers, progress=progress),
+                map_items=partial(parallel_map, workers=args.workers, progress=progress),
             )
         with timed("drawing"):
             details = origin() | json.loads(json.dumps(asdict(args), default=str))

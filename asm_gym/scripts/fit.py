@@ -43,8 +43,8 @@ from asm_gym.validation import check_number
 
 SILENCE_S = 2.0  # a live source without a row for this long has ended [s]
 PIECE_S = 5.0  # longest pieces of a live recording [s]
-SPARE = 4  # pieces of a live recording beyond what the promise needs
-ANY_EPISODE = 0.5  # a rate that one episode can promise: a promise by the hour needs hours
+SPARE_PIECES = 4  # pieces of a live recording beyond what the promise needs
+FEWEST_CALIBRATION = 1  # calibration episodes for a promise by the hour, which needs hours instead
 CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are not learned from
 QUICK_EPISODES = 20  # most episodes with ``--quick``
 QUICK_EPOCHS = 5  # most passes with ``--quick``
@@ -110,7 +110,7 @@ class Args(LogOptions):
 
 
 def record_live(args: Args, say: Callable[[str], None]) -> Args:
-    """Record a live source; return how to learn from that, cut into as many pieces as the promise needs."""
+    """Record a live source; return options that read the recording, in as many pieces as the promise needs."""
     file = args.out.with_suffix(".jsonl")
     if file == args.out or str(args.data) == f"tail:{file}":
         raise ValueError(f"rows are kept in {file}, which is in use: give --out another name")
@@ -121,7 +121,7 @@ def record_live(args: Args, say: Callable[[str], None]) -> Args:
     if piece_s is None:
         pieces_needed = 1.0
         if args.needed:
-            pieces_needed = args.needed / CALIBRATION_SHARE + SPARE
+            pieces_needed = args.needed / CALIBRATION_SHARE + SPARE_PIECES
         piece_s = min(PIECE_S, seconds / pieces_needed)
     return replace(args, data=file, split=max(piece_s, SHORTEST_PART_S))
 
@@ -149,7 +149,7 @@ def divide(
                 "take a higher --false-alarm-rate"
             )
     else:
-        needed = args.needed or conformal_episodes(ANY_EPISODE)
+        needed = args.needed or FEWEST_CALIBRATION
         fitting, calibration = training_selection.split_at_random(
             flat(stretches), needed, CALIBRATION_SHARE, args.seed
         )
@@ -233,19 +233,19 @@ def incomplete_columns(episodes: list[Episode]) -> str:
     """Return the columns that lack the most numbers, and in how many rows."""
     missing = np.mean([np.isnan(e.stream).mean(axis=0) for e in episodes], axis=0)  # (D,)
     labels = episodes[0].spec.labels
-    worst = np.argsort(-missing)[:MOST_COLUMNS]
-    return ", ".join(f"{labels[k]} in {missing[k]:.0%}" for k in worst if missing[k])
+    worst = [column for column in np.argsort(-missing)[:MOST_COLUMNS] if missing[column]]
+    return ", ".join(f"{labels[column]} in {missing[column]:.0%}" for column in worst)
 
 
 def settings(args: Args) -> dict[str, Any]:
-    """Return the hyperparameters that suit the recordings."""
-    suitable: dict[str, Any] = {"seed": args.seed}
+    """Return the hyperparameters that the options set, of those that the monitor has."""
+    wanted: dict[str, Any] = {"seed": args.seed}
     if args.quick:
-        suitable["epochs"] = QUICK_EPOCHS
+        wanted["epochs"] = QUICK_EPOCHS
     if args.urdf is not None:
-        suitable["urdf"] = read_urdf(args.urdf)
+        wanted["urdf"] = read_urdf(args.urdf)
     known = monitor_class(args.monitor).hyperparameters
-    return {name: value for name, value in suitable.items() if name in known}
+    return {name: value for name, value in wanted.items() if name in known}
 
 
 def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
@@ -266,7 +266,7 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
     """Yield notes on the gain from the body model, and the column of each joint."""
     if args.urdf is None:
         return
-    model = monitor.model
+    model = monitor.model  # that predicts torques; a memory keeps it in its second monitor
     if isinstance(monitor, NeuralASM) and monitor.values_ is not None:
         model = monitor.values_.monitor.model
     if not isinstance(model, ValueAssociation):
@@ -293,7 +293,7 @@ def hours_of(episodes: list[Episode]) -> float:
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
-def read(args: Args, console: Console) -> tuple[list[Episode], str]:
+def read_normal(args: Args, console: Console) -> tuple[list[Episode], str]:
     """Return the normal episodes, and which others were left out; ValueError where there is none."""
     logs = read_logs(args.data, args.hints(args.action), args.given_schema())
     with stage("reading", console) as progress:
@@ -319,7 +319,7 @@ def fit(args: Args, console: Console) -> int:
     start = time.perf_counter()
 
     with noted() as notes:
-        episodes, left_out = read(args, console)
+        episodes, left_out = read_normal(args, console)
     parts, notes_on_parts = parts_between_gaps(args, episodes)
     stretches = [[part] for part in parts]
     if args.split is not None:
@@ -353,10 +353,10 @@ def fit(args: Args, console: Console) -> int:
     return exit_code_of_reading(notes)
 
 
-def summary_of_threshold(args: Args, monitor: Any, calibration: int) -> Iterator[str]:
+def summary_of_threshold(args: Args, monitor: Any, calibration_episodes: int) -> Iterator[str]:
     """Yield the threshold and its promise, and the false alarms to expect.
 
-    It was set from ``calibration`` episodes, less those that set ceilings.
+    Some of the ``calibration_episodes`` set the ceilings of the senses, and all others the threshold.
     """
     hours = monitor.blocks_.total
     used = len(monitor.maxima_)
@@ -365,14 +365,14 @@ def summary_of_threshold(args: Args, monitor: Any, calibration: int) -> Iterator
         promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
     if monitor.promise.modelled:
         promise += ", by a model of the tail of their maxima, as they are few"
-    if used < calibration:
-        promise += f"; {calibration - used} more say how far each sense goes"
+    if used < calibration_episodes:
+        promise += f"; {calibration_episodes - used} more say how far each sense goes"
     yield f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}."
 
-    expected, most = monitor.promise.hourly(hours)
+    expected, at_most = monitor.promise.hourly(hours)
     line = (
         f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an "
-        f"hour, at most {most:.3g} with 95 % confidence; other motion raises more."
+        f"hour, at most {at_most:.3g} with 95 % confidence; other motion raises more."
     )
     if expected > 1.0:
         line += f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."

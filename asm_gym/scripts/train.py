@@ -23,7 +23,7 @@ from asm_gym.files import write_text
 from asm_gym.policies import rollout
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
-from asm_gym.rollouts.run_trials import check, collect_to
+from asm_gym.rollouts.run_trials import check_config, collect_to
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training import TrainingSettings, train
 from asm_gym.rollouts.trial import RolloutConfig
@@ -66,7 +66,7 @@ def train_agent(args: Args, console: Console) -> None:
     make = partial(gym.make, task, **dict(config.settings))
     make().close()  # bad options are refused before the folder is made
     if args.dataset is None:
-        check(task, config)
+        check_config(task, config)
         episodes = []
     else:
         episodes = read_dataset(args.dataset, env_id=task)

@@ -58,9 +58,9 @@ from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
-LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy")  # options
-RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
-PRINTED = 20  # alarms of a recording; the file holds them all
+LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy")  # options of a live source
+RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")  # options of a recording
+MOST_PRINTED = 20  # alarms of a recording; the file holds them all
 DRAWN_EPISODES = 4  # episodes in the report, the most surprising ones
 
 
@@ -103,18 +103,18 @@ class Review:
     """Alarms in the recordings that were scored up to now."""
 
     alarms: list[Alarm] = field(default_factory=list)
-    worst: list[ScoredEpisode] = field(
-        default_factory=list
-    )  # ``DRAWN_EPISODES``, the most surprising first
+    # the ``DRAWN_EPISODES`` with the greatest surprise, the greatest first
+    worst: list[ScoredEpisode] = field(default_factory=list)
     episodes: int = 0
     excused: Counter[str] = field(default_factory=Counter)  # events that were no alarms
     bridged_rows: int = 0
 
     def add(self, logs: Sequence[Log], monitor: Any, bridge: float) -> None:
         """Score some recordings; gaps of at most ``bridge`` [s] are not judged."""
-        for log, trace in zip(logs, recorded_alarms.traces_of(logs, monitor, bridge), strict=True):
-            rows = bridged(log.episode.stream, monitor.spec.dt, bridge)
-            self.bridged_rows += int(rows.sum())
+        traces = recorded_alarms.traces_of(logs, monitor, bridge)
+        for log, trace in zip(logs, traces, strict=True):
+            is_bridged = bridged(log.episode.stream, monitor.spec.dt, bridge)  # (T,)
+            self.bridged_rows += int(is_bridged.sum())
             self.alarms += recorded_alarms.alarms_of(trace, log.episode.info.get(LOG_ORIGIN))
             self.excused.update(recorded_alarms.excused_in(trace))
             self.worst.append(trace)
@@ -148,7 +148,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     rows = [map(recorded_alarms.plain_cell, alarm.cells()) for alarm in reviewed.alarms]
     csv.writer(table).writerows([HEADINGS, *rows])
     write_text(args.out / "alarms.csv", table.getvalue())
-    written = publish(args, reviewed)
+    written = write_figures_and_report(args, reviewed)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     if args.json:
         say_events(reviewed, notes, say)
@@ -199,16 +199,17 @@ def say_table(
             f"{bridge:.3g} s: they are not judged."
         )
     alarms = sorted(reviewed.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
-    printed = alarms[:PRINTED]
+    printed = alarms[:MOST_PRINTED]
     summary = reviewed.summary()
     if len(printed) < len(alarms):
-        summary += f"; the {PRINTED} largest:"
+        summary += f"; the {MOST_PRINTED} largest:"
     say(summary)
     if not printed:
         return
     has_stamps = any(alarm.stamp is not None for alarm in printed)
     width = max(len(alarm.channel) for alarm in printed)
-    for cells in (HEADINGS, *(alarm.cells() for alarm in printed)):
+    lines_of_cells = [HEADINGS, *(alarm.cells() for alarm in printed)]
+    for cells in lines_of_cells:
         log, start, end, channel, why, excess, stamp, _ = cells
         clock = ""
         if has_stamps:
@@ -229,8 +230,8 @@ def schema_of(args: Args, monitor: Any) -> LogSchema:
     return given
 
 
-def publish(args: Args, reviewed: Review) -> str:
-    """Write a report with the most surprising episodes; return what was written, and what is missing for more."""
+def write_figures_and_report(args: Args, reviewed: Review) -> str:
+    """Write figures of the most surprising episodes and a report; return what was written, or what is missing."""
     try:
         with needed_for("the report"):
             from asm_gym.evaluation import figures
@@ -260,7 +261,7 @@ def publish(args: Args, reviewed: Review) -> str:
 
 
 def refuse_options(args: Args, names: Sequence[str], purpose: str, source: str) -> None:
-    """Raise ValueError where one of these options is given, for which the source is of the wrong kind."""
+    """Raise ValueError if one of the options ``names`` is given, as the source is of the other kind."""
     for name in names:
         if getattr(args, name):
             option_name = f"--{name.replace('_', '-')}"
@@ -283,21 +284,21 @@ def watch(args: Args, console: Console) -> int:
 
 
 def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int:
-    """Watch a live source; one that ``returns`` after its death is opened anew."""
-    opened = partial(lines_from, args.source, sys.stdin, args.silence)
+    """Watch a live source; where it ``returns``, it is opened anew after it has gone silent."""
+    # A function of how long the first line may take [s].
+    open_lines = partial(lines_from, args.source, sys.stdin, args.silence)
     reopen: Callable[[float], Iterator[str]] | None = None
     if returns:
-        reopen = opened
-    first_silence_s = max(args.wait, args.silence)
-    lines = opened(first_silence_s)
+        reopen = open_lines
+    lines = open_lines(max(args.wait, args.silence))
     beat = None
     outlets = outlets_of(args, console)
     with _watchdog(args, monitor.spec.dt) as watchdog:
-        event = f"watching {args.source}"
+        announcement = f"watching {args.source}"
         if watchdog is not None:
-            event += ", guarded by a watchdog"
+            announcement += ", guarded by a watchdog"
             beat = watchdog.beat
-        say_aside(event)
+        say_aside(announcement)
         settings = WatchSettings(
             bridge_s=bridge_of(args.bridge, monitor.spec.dt),
             reopen=reopen,
@@ -320,7 +321,7 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
 
 
 def outlets_of(args: Args, console: Console) -> AlarmOutlets:
-    """Return what runs the hook, publishes alarms and prints events, in this order."""
+    """Return the outlets of events: first the hook, then the topic of ROS 2, then standard output."""
     outlets: list[Callable[[LiveEvent], object]] = []
     if args.hook:
         outlets.append(partial(run_hook, args.hook))
@@ -331,10 +332,10 @@ def outlets_of(args: Args, console: Console) -> AlarmOutlets:
 
 
 def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:
-    """Return the watchdog that is asked for, in a watch of rows ``dt`` [s] apart.
+    """Return the watchdog that the options ask for, where rows come every ``dt`` [s]; an empty context if none.
 
     Raises:
-        ValueError: it could not do anything.
+        ValueError: it lacks a time or a hook, or its time is not longer than ``dt``.
     """
     if args.watchdog is None and args.policy is None:
         return nullcontext()

@@ -46,8 +46,9 @@ def robots_of(
     attributes = EnvAttributes(env)
     space = attributes.action_space
     if not isinstance(space, gym.spaces.Box):
-        none = np.zeros(0, np.float32)
-        return RobotFacts(count=1, low=none, high=none, rest=none, dt=dt), None
+        no_action = np.zeros(0, np.float32)
+        facts = RobotFacts(count=1, low=no_action, high=no_action, rest=no_action, dt=dt)
+        return facts, None
 
     resting = resting_of(attributes, space, recorded, action_means)
     refused = refused_reflexes(attributes, resting)
@@ -60,7 +61,7 @@ def robots_of(
         refused["complete"] = str(error)
 
     size = resting.action.size
-    robots = RobotFacts(
+    facts = RobotFacts(
         count=attributes.count,
         low=np.float32(space.low).ravel(),
         high=np.float32(space.high).ravel(),
@@ -79,7 +80,7 @@ def robots_of(
         efference=efference_columns(attributes, spec, size),
         refused=refused,
     )
-    return robots, observation_map
+    return facts, observation_map
 
 
 def controller_of(attributes: EnvAttributes) -> str:
@@ -160,8 +161,9 @@ def declared_meaning(
 
 
 def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
-    """Return the kinematics of each arm in each environment: ``hand_chains``; none without it."""
-    return tuple(zip(*attributes.ask("hand_chains"), strict=True))
+    """Return the kinematics by arm, then by environment: ``hand_chains``; none without it."""
+    by_environment = attributes.ask("hand_chains")
+    return tuple(zip(*by_environment, strict=True))
 
 
 def felt_channels(attributes: EnvAttributes) -> tuple[Channel, ...]:
@@ -243,10 +245,10 @@ def observation_map_of(attributes: EnvAttributes, spec: StreamSpec) -> Observati
     layout = attributes.first("observation_layout")
     if not has_stream(attributes) or layout is None:
         raise ValueError("the environment does not say where its stream stands in its observation")
-    default = None
+    innermost_space = None
     if not attributes.is_vector:
-        default = attributes.env.unwrapped.observation_space
-    own_space = attributes.first("laid_out_space", default)
+        innermost_space = attributes.env.unwrapped.observation_space
+    own_space = attributes.first("laid_out_space", innermost_space)
     if own_space is not None and space != own_space:
         raise ValueError(f"a wrapper inside has changed the observation, which was {own_space}")
     return ObservationMap(parts_of(layout, spec, space), spec.size)

@@ -38,8 +38,8 @@ from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.capabilities import controller_of, robots_of
 from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes, askable
 
-# Attribute of wrappers that count episodes, Gymnasium's and Stable-Baselines3's.
-COUNTS = "episode_returns"
+# Attribute by which wrappers that count episodes are known, Gymnasium's and Stable-Baselines3's.
+COUNTER_ATTRIBUTE = "episode_returns"
 
 
 class Guarding:
@@ -101,9 +101,10 @@ class Guarding:
         check_answer(monitor)
         self._check(monitor)
 
-        recorded = getattr(monitor, "about", {}).get(ACTIONS)
-        if recorded is not None:
-            recorded = ActionMeaning.from_json(recorded)
+        recorded: ActionMeaning | None = None
+        recorded_json = getattr(monitor, "about", {}).get(ACTIONS)
+        if recorded_json is not None:
+            recorded = ActionMeaning.from_json(recorded_json)
         self._facts, self._observation_map = robots_of(
             self.env, monitor.spec, self._period, recorded, options.action_means
         )
@@ -138,9 +139,10 @@ class Guarding:
                 self.env.unwrapped.limits_of_guard = named_limits[0]
         self._limits = limits
 
-    def _watch_with_next(self) -> None:
-        """Take over the monitor that was assigned, or was fitted or calibrated since."""
-        if FittedMonitor.of(self._next_monitor, self._spec).differs(self.guard.fitted):
+    def _take_over_changed_monitor(self) -> None:
+        """Take over the monitor that was assigned, or was fitted or calibrated since; else change nothing."""
+        fitted = FittedMonitor.of(self._next_monitor, self._spec)
+        if fitted.differs(self.guard.fitted):
             LOG.info(
                 "the monitor was changed, fitted or calibrated since: it is taken over as it is now"
             )
@@ -173,10 +175,11 @@ class Guarding:
 
     def _stopped(self, reports: Sequence[RowReport]) -> Mask:
         """Return (n,) whose episode the guard ends."""
-        stopped = reports[-1].gave_up
+        gave_up = reports[-1].gave_up
         if self.guard.ends_on_alarm:
-            return np.any([stopped, *(report.ends for report in reports)], axis=0)
-        return stopped
+            alarms = [report.ends for report in reports]
+            return np.any([gave_up, *alarms], axis=0)
+        return gave_up
 
     def _running_threshold(self) -> dict[str, float]:
         """Return what ``info["asm"]`` says of a threshold that follows the policy; nothing where none does."""
@@ -227,12 +230,13 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
     """
     policy = on_alarm
     needs = "have a predict(), or make a policy"
-    makes_policy = isinstance(on_alarm, type) or not hasattr(on_alarm, "predict")
+    is_class = isinstance(on_alarm, type)
+    makes_policy = callable(on_alarm) and (is_class or not hasattr(on_alarm, "predict"))
     if isinstance(env, VectorEnv):
         needs = "one policy with a predict() that all environments share"
         makes_policy = False
     try:
-        if makes_policy and callable(on_alarm):
+        if makes_policy:
             policy = on_alarm(env)
         if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
             raise TypeError("it has no predict()")
@@ -266,12 +270,13 @@ def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
         guard: the name of the guard's class.
         on_alarm: what the guard does at an alarm; under ``"monitor"`` it ends no episode.
     """
-    ends = not (isinstance(on_alarm, str) and on_alarm == "monitor")
+    only_reports = isinstance(on_alarm, str) and on_alarm == "monitor"
+    ends_episodes = not only_reports
     for layer in layers(env):
         attributes = vars(layer)
         reported = attributes.get("info_keywords", ())  # of Stable-Baselines3's Monitor
         reports_guard = any(key.startswith(("asm", "cost")) for key in reported)
-        if COUNTS in attributes and (ends or reports_guard):
+        if COUNTER_ATTRIBUTE in attributes and (ends_episodes or reports_guard):
             name = type(layer).__name__
             raise ValueError(
                 f"{name} inside the guard would miss the episodes that the guard ends, "
@@ -279,9 +284,9 @@ def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
                 "with Stable-Baselines3, "
                 "make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))"
             )
-    if not (isinstance(env, VectorEnv) and ends):
+    if not (isinstance(env, VectorEnv) and ends_episodes):
         return
-    if any(EnvAttributes(env).call("has_wrapper_attr", COUNTS)):
+    if any(EnvAttributes(env).call("has_wrapper_attr", COUNTER_ATTRIBUTE)):
         raise ValueError(
             "wrappers of the members that count episodes would miss those that the guard ends: use "
             f"gymnasium.wrappers.vector.RecordEpisodeStatistics({guard}(envs, monitor))"

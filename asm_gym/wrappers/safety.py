@@ -135,21 +135,21 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
         info = dict(info)
-        self._watch_with_next()
-        nothing = self.guard.begin()
+        self._take_over_changed_monitor()
+        report = self.guard.begin()
         self._limit_contact(anew=True)
         self._observation = observation
         self._first_info = info
         self._row: Floats32 | None = None  # (D,) sensed last in this episode
         self._alarms = np.zeros(1, np.int64)
         self._solved = False
-        self._preview = Preview(None)
-        self._previewed = 0  # actions left of the chunk that was previewed
+        self._preview = Preview(at=None)
+        self._previewed_actions = 0  # of the previewed chunk, not executed yet
         if self._facts.meaning is not None:
             self.guard.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
         self._executed = np.zeros(0, np.float32)
-        self.report_step([nothing], info)
+        self.report_step([report], info)
         return observation, info
 
     def preview(self, actions: Any) -> Preview:
@@ -169,7 +169,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             last = self._executed.ravel()
         preview = self.guard.preview(0, chunk.reshape(len(chunk), -1), row, last)
         self._preview = preview._replace(kept=chunk[: len(preview.kept)])
-        self._previewed = len(chunk)
+        self._previewed_actions = len(chunk)
         return self._preview
 
     def step(self, action: Any) -> StepResult:
@@ -253,13 +253,13 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         Rows within the step are judged meanwhile, and a hold lasts through all its parts; one that a guard outside has
         asked for goes on.
         """
-        hooks: list[Any] = []
+        row_hooks: list[Any] = []  # called by nobody where a step is one row
         if self._rows_per_step > 1:
-            hooks = self.env.get_wrapper_attr("row_hooks")
-        hooks.append(self._judge_within_step)
+            row_hooks = self.env.get_wrapper_attr("row_hooks")
+        row_hooks.append(self._judge_within_step)
         inner = self._inner
-        keeps_holding = self._holds_itself and inner.keeps_holding
-        held = keeps_holding and inner.holding
+        kept_holding = self._holds_itself and inner.keeps_holding  # a guard outside asked for it
+        held = kept_holding and inner.holding
         try:
             if self._holds_itself:
                 inner.keeps_holding = True
@@ -267,9 +267,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             return overridden, self._source.step(as_action(self._box, self._executed))
         finally:
             if self._holds_itself:
-                inner.keeps_holding = keeps_holding
+                inner.keeps_holding = kept_holding
                 inner.holding = held
-            hooks.remove(self._judge_within_step)
+            row_hooks.remove(self._judge_within_step)
 
     def _judge_within_step(self, row: Floats32) -> None:
         """Judge a row that the environment senses in the middle of a step; a reflex acts at once."""
@@ -319,15 +319,17 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     def _count_down(self) -> dict[str, Any] | None:
         """Return what ``info`` says of the chunk that was previewed, an action of which is done; None without one."""
-        if not self._previewed:
+        if not self._previewed_actions:
             return None
-        at = self._preview.at
-        if at is not None:
-            at -= 1
-        self._preview = self._preview._replace(at=at)
-        self._previewed -= 1
-        if at == -1:
-            self._previewed = 0
-        if not self._previewed:
+        actions_before = self._preview.at  # the action that should not be executed
+        if actions_before is not None:
+            actions_before -= 1
+        self._preview = self._preview._replace(at=actions_before)
+
+        self._previewed_actions -= 1
+        was_executed = actions_before == -1  # that action: the prediction holds no longer
+        if was_executed:
+            self._previewed_actions = 0
+        if not self._previewed_actions:
             return None
-        return {"at": at, "reason": self._preview.reason, "known": self._preview.known}
+        return {"at": actions_before, "reason": self._preview.reason, "known": self._preview.known}

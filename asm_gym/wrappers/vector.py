@@ -142,7 +142,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._observations, infos = self.env.reset(seed=seed, options=copy(options))
         self._ended = ended
         if begun.all():
-            self._watch_with_next()
+            self._take_over_changed_monitor()
         infos = dict(infos)
         self._present = begun
         self._commanded = np.full(self._flat_shape, np.nan, np.float32)
@@ -283,10 +283,10 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._forced[begun] = False
         self._alarms[begun] = 0
         if not begun.any():
-            return self.guard.nothing()
-        nothing = self.guard.begin(begun)
+            return self.guard.empty_report()
+        report = self.guard.begin(begun)
         self._limit_contact(anew=True)
-        return nothing
+        return report
 
     def _describe(self, reports: Sequence[RowReport]) -> Callable[[], dict[str, Any]]:
         facts = self._facts

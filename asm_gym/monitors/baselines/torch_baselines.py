@@ -120,29 +120,31 @@ def train_on_episodes(
     A fifth of the ``episodes`` is not trained on, none of fewer than five; ``loss`` is that of some, training or not.
     """
     order = rng.permutation(episodes).astype(np.intp)
-    kept = episodes // ONE_IN_FRESH
-    trained = order[kept:]
-    fresh = order[:kept] if kept else order
+    fresh_count = episodes // ONE_IN_FRESH
+    trained = order[fresh_count:]
+    fresh = order[:fresh_count]
+    if not fresh_count:
+        fresh = order
     optimiser = torch.optim.Adam(module.parameters(), FIRST_RATE)
     plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(
         optimiser, factor=RATE_CUT, patience=PATIENCE
     )
-    least = math.inf
-    best = copy.deepcopy(module.state_dict())
+    least_loss = math.inf
+    best_weights = copy.deepcopy(module.state_dict())
     for epoch in range(EPOCHS):
         progress(epoch, EPOCHS)
         order = rng.permutation(trained)
         for start in range(0, len(order), EPISODES_IN_BATCH):
             descend(loss(order[start : start + EPISODES_IN_BATCH], True), optimiser)
         with torch.no_grad():
-            now = float(loss(fresh, False))
-        if now < least:
-            least = now
-            best = copy.deepcopy(module.state_dict())
-        plateaus.step(now)
+            fresh_loss = float(loss(fresh, False))
+        if fresh_loss < least_loss:
+            least_loss = fresh_loss
+            best_weights = copy.deepcopy(module.state_dict())
+        plateaus.step(fresh_loss)
         if optimiser.param_groups[0]["lr"] < FINAL_RATE:
             break
-    module.load_state_dict(best)
+    module.load_state_dict(best_weights)
 
 
 def adam(
@@ -231,7 +233,8 @@ class GRU(TorchModel):
             huber = nn.functional.huber_loss(
                 error, torch.zeros_like(mean), reduction="none", delta=FULL_WEIGHT_ERROR
             )
-            return ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
+            loss_of_rows = (huber + 0.5 * log_variance).mean(dim=-1)
+            return (loss_of_rows * real).sum() / real.sum()
 
         train_on_episodes(module, loss, len(readings), rng, progress)
 
@@ -294,8 +297,10 @@ class LogpZO(TorchModel):
             x = torch.as_tensor(rows[chosen])
             noise = torch.randn_like(x)
             s = torch.rand(len(x), 1)
-            flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
-            descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
+            between = (1.0 - s) * x + s * noise
+            flow = module(torch.cat([between, s], dim=1))
+            loss = ((flow - (noise - x)) ** 2).mean()
+            descend(loss, optimiser, schedule)
 
     def predict(
         self, state: RowHistory, rows: NDArray[np.float64]

@@ -54,9 +54,8 @@ Places = NDArray[np.intp]
 
 ALIKE_S = 0.1  # time that errors are averaged over [s]
 PREDICTED = 0.5  # R² from which on a value is judged
-MOST_LEVERAGE_INPUTS = (
-    1024  # with more inputs no leverage is computed: the matrices would be too large
-)
+# With more inputs no leverage is computed: the matrices would be too large.
+MOST_LEVERAGE_INPUTS = 1024
 
 LEARNED = (
     "derived_mean",  # (M,) of the features φ
@@ -201,19 +200,19 @@ class ValueAssociation(ScaledModel):
 
         expected = inputs @ learned["D"].T
         rest = scaled.values[:, self._judged] - expected
-        error = known * rest / self._widening(inputs)
+        error = known * rest / self._widening(inputs)  # (B, V) r; 0 in the first rows
         errors = np.concatenate([state.errors[:, 1:], error[:, None]], axis=1)
         mean = errors.mean(axis=1) / learned["largest"]
         return AveragedErrors(history, errors), ModelOutput(mean, no_context(rows))
 
     def judged(self, R2: Floats) -> Places:
         """Return which values are judged, by their cross-fitted R² (X,)."""
-        judged = R2 > PREDICTED
-        moving = np.searchsorted(self.spec.sensory, motion_columns(self.spec))
-        if len(self._torques) and len(moving):
-            judged[moving] = False
-            judged[self._torques] = True
-        return np.flatnonzero(judged)
+        is_judged = R2 > PREDICTED
+        positions_and_speeds = np.searchsorted(self.spec.sensory, motion_columns(self.spec))
+        if len(self._torques) and len(positions_and_speeds):
+            is_judged[positions_and_speeds] = False
+            is_judged[self._torques] = True
+        return np.flatnonzero(is_judged)
 
     def _regression_rows(self, reading: ScaledRows) -> RegressionRows:
         """Return rows as regression reads them."""
@@ -286,6 +285,7 @@ class ValueAssociation(ScaledModel):
 
     def _withheld(self, features: ArmFeatures) -> list[Places]:
         """Return the inputs of each group that hold its own values, which it is not predicted from."""
+        # Columns of ``inputs_of``: values, changes, values before, features, commands.
         senses = len(self.spec.sensory)
         groups = self.senses_.groups
         before = 2 * senses + np.arange(senses)  # a value is predicted from this row alone
@@ -303,16 +303,18 @@ class ValueAssociation(ScaledModel):
 
         There are none where torques, speeds and angles of a body model do not belong together one by one.
         """
+        # Columns of ``inputs_of``: values, changes, values before, features, commands.
         senses = len(self.spec.sensory)
         joints = len(features.speeds)
-        kinds = len(WIDTHS)
+        features_per_joint = len(WIDTHS)
         if len(self._torques) != joints:
             return {}
         if features.body is not None:
-            kinds += 2  # weight and motion
+            features_per_joint += 2  # weight and motion
             if len(features.angles) != joints:
                 return {}
-        of_first_joint = 3 * senses + joints * np.arange(kinds)
+        # Each feature of all joints comes before the next feature.
+        of_first_joint = 3 * senses + joints * np.arange(features_per_joint)
         commands = np.arange(inputs - len(self.spec.motor) - 1, inputs)
         speeds = features.speeds + senses * features.from_changes
         own_inputs = {}
@@ -324,7 +326,7 @@ class ValueAssociation(ScaledModel):
         """Return cross-fitted errors (N, V), less where leverage is large, and the leverage (G, I, I) of each group."""
         regression = fit.regression
         size = regression.weights.shape[1]
-        errors = regression.errors[:, judged]
+        errors = regression.errors[:, judged]  # a copy
         if size > MOST_LEVERAGE_INPUTS:
             return errors, np.zeros((0, size, size))
         groups = self.senses_.groups[judged]

@@ -100,7 +100,7 @@ class ValueJudge:
         require_arrays(own, ("leverage", *SCALARS))
         leverage = own.pop("leverage")
         scalars = {name: float(own.pop(name)) for name in SCALARS}
-        monitor = _monitor(spec, seed, urdf).with_learned(own)
+        monitor = _monitor(spec, seed, urdf).restore_learned(own)
         size = _model(monitor).senses_.inputs + 1
         if leverage.shape not in ((size, size), (0, 0)):
             raise ValueError(

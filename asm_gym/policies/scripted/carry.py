@@ -17,7 +17,7 @@ from asm_gym.policies.scripted.expert import (
     Scene,
     State,
     has_settled,
-    over_first,
+    height_while_aside,
 )
 from asm_gym.policies.scripted.geometry import (
     UP,
@@ -124,7 +124,7 @@ class CarryScene(Scene):
     def descend(self) -> Vector:
         target = self.grip
         if self.is_careful:
-            target = target + over_first(self.hand.position, target)
+            target = target + height_while_aside(self.hand.position, target)
         speed = self.state.speed * self.plan.haste
         return command_towards(self.hand, target, self._turning(self.grasping), speed, self.gain)
 

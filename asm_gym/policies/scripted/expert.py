@@ -64,7 +64,7 @@ class Style:
 
 
 class ObservationReader:
-    """Named parts of an environment's flat or dict observation."""
+    """Reads named parts of an environment's flat or dict observation: ``read(observation, "hand_position")``."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._is_flat = isinstance(env.observation_space, spaces.Box)
@@ -112,8 +112,8 @@ class Phase(NamedTuple):
 
     command: Callable[[Any], Vector]  # (6,) of the hand [action units]
     gripper: float | None  # ``OPEN`` or ``CLOSE``; None where the hand is a tool
-    # when which phase follows; the first condition that holds counts
-    ends: Mapping[int, Callable[[Any], bool]] = MappingProxyType({})
+    # the phases that may follow, each with its condition; the first that holds counts
+    next_phases: Mapping[int, Callable[[Any], bool]] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class Expert(StatefulPolicy):
         steps = state.steps_in_phase + 1
         scene = self.observe(observation, state._replace(steps_in_phase=steps, noise=noise))
         state = self.advance(scene, observation)
-        if state is not scene.state:
+        if state is not scene.state:  # another phase has begun
             scene = self.observe(observation, state)
 
         phase = scene.phases[state.phase]
@@ -198,7 +198,7 @@ class Expert(StatefulPolicy):
 
     def advance(self, scene: Any, observation: Any) -> State:
         """Return the state in the phase that follows, or as it is while the phase's work is not done."""
-        for phase, is_due in scene.phases[scene.state.phase].ends.items():
+        for phase, is_due in scene.phases[scene.state.phase].next_phases.items():
             if is_due(scene):
                 return self.entered(scene, phase)
         return scene.state
@@ -225,7 +225,7 @@ def has_settled(velocity: Vector, steps: int, usual: int) -> bool:
     return (steps >= 2 * usual and is_still) or steps >= 5 * usual
 
 
-def over_first(position: Vector, target: Vector) -> Vector:
+def height_while_aside(position: Vector, target: Vector) -> Vector:
     """Return how much higher (3,) than its target a careful hand goes while it is aside of it [m].
 
     A finger would come down on the object otherwise.

@@ -15,7 +15,7 @@ from asm_gym.policies.scripted.expert import (
     Scene,
     State,
     has_settled,
-    over_first,
+    height_while_aside,
 )
 from asm_gym.policies.scripted.geometry import (
     UP,
@@ -60,7 +60,7 @@ class LiftScene(Scene):
     def descend(self) -> Vector:
         target = self.cube.position - self.plan.depth * UP
         if self.is_careful:
-            target = target + over_first(self.hand.position, self.cube.position)
+            target = target + height_while_aside(self.hand.position, self.cube.position)
         return self._fit_sides(target)
 
     def is_around(self) -> bool:

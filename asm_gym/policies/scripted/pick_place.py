@@ -55,10 +55,10 @@ class PickPlaceExpert(CarryExpert):
             return None
         name = self.robosuite.objects[number].name
         thing = self.read.pose(observation, name)
-        half = self._half_extents(name)
-        grip = max(0.0, half[2] - 0.02)
-        closing = self._closing(name, thing, half, grip)
-        place = self._place(number, half, grip)
+        half_size = self._half_extents(name)
+        grip = max(0.0, half_size[2] - 0.02)
+        closing = self._closing(name, thing, half_size, grip)
+        place = self._place(number, half_size, grip)
         haste = 1.0
         if closing.room < ENOUGH_ROOM:
             haste = SLOWLY
@@ -90,20 +90,21 @@ class PickPlaceExpert(CarryExpert):
                 distances[number] = length(at - hand)
         return min(distances, key=distances.__getitem__, default=None)
 
-    def _closing(self, name: str, thing: Pose, half: Vector, grip: float) -> Closing:
+    def _closing(self, name: str, thing: Pose, half_size: Vector, grip: float) -> Closing:
         """Return how to close on an object, of half this size (3,), that is held ``grip`` above its middle [m]."""
         env = self.robosuite
         from_middle = thing.position[:2] - env.bin1_pos[:2]
         to_walls = env.bin_size[:2] / 2 - np.abs(from_middle)
         palm = thing.position[2] + grip + PALM_HEIGHT
         if not self.is_careful and palm < env.bin1_pos[2] + WALL_HEIGHT:
-            return beside_walls(half, thing.orientation, to_walls)
+            return beside_walls(half_size, thing.orientation, to_walls)
 
         # Of the narrow axes that one which lies furthest from the walls.
-        axes = _narrow(half)
+        axes = _graspable_axes(half_size)
         if self.is_careful and name == "Can":
             axes += DIAGONALS
         along = max(axes, key=lambda axis: _way_to_wall(thing.orientation @ axis, to_walls))
+        # The palm stays above the walls; that of another arm than a Panda is not compared with them.
         return Closing(along, room=ENOUGH_ROOM)
 
     def _headings(self, place: Vector, closing: Vector) -> tuple[float, ...]:
@@ -115,7 +116,7 @@ class PickPlaceExpert(CarryExpert):
         heading = float(sideways - np.arctan2(closing[1], closing[0]))
         return (heading, heading + np.pi)
 
-    def _place(self, number: int, half: Vector, grip: float) -> Vector:
+    def _place(self, number: int, half_size: Vector, grip: float) -> Vector:
         """Return where (3,) to let go.
 
         That is off the compartment's middle: towards the arm, or beyond a Panda's reach towards the
@@ -131,15 +132,15 @@ class PickPlaceExpert(CarryExpert):
             place[:2] += 0.08 * inwards / length(inwards)
             place[2] += 0.02
         else:
-            place[:2] -= self._nearer(away, half)
+            place[:2] -= self._shift_towards_arm(away, half_size)
 
         # Lower, and the palm would stand on a wall.
-        place[2] += max(half[2] + 0.015, LOWEST_FINGERTIPS - grip)
+        place[2] += max(half_size[2] + 0.015, LOWEST_FINGERTIPS - grip)
         if self.is_careful:  # stretched out, another arm may stand nearer to a wall than it should
             place[2] += 0.04
         return place
 
-    def _nearer(self, away: Vector, half: Vector) -> Vector:
+    def _shift_towards_arm(self, away: Vector, half_size: Vector) -> Vector:
         """Return how far (2,) to come back towards the arm from a place that is ``away`` (2,) from its base [m]."""
         distance = length(away)
         if not self.is_careful:
@@ -148,8 +149,8 @@ class PickPlaceExpert(CarryExpert):
         if distance > REACH_OF_PANDA:
             return nearer
         # Further, a tall box would stand on a wall.
-        quarter = np.asarray(self.robosuite.bin_size[:2]) / 4
-        room = np.maximum(quarter - CLEAR - length(half[:2]), 0.0)
+        half_compartment = np.asarray(self.robosuite.bin_size[:2]) / 4
+        room = np.maximum(half_compartment - CLEAR - length(half_size[:2]), 0.0)
         return np.clip(nearer, -room, room)
 
     def _half_extents(self, name: str) -> Vector:
@@ -162,18 +163,18 @@ class PickPlaceExpert(CarryExpert):
         return np.abs(turn) @ model.geom_aabb[geom, 3:]
 
 
-def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> Closing:
+def beside_walls(half_size: Vector, turned: Vector, to_walls: Vector) -> Closing:
     """Return how to close on an object in a bin, and the room that the palm has then.
 
     Square to the object where there is room, else as far askew as it takes; square in corners,
     where nothing helps.
 
     Args:
-        half: (3,) half the object's size [m].
+        half_size: (3,) half the object's size [m].
         turned: (3, 3) its orientation.
         to_walls: (2,) the way from its middle to the nearer walls of the bin [m].
     """
-    axes = _narrow(half)
+    axes = _graspable_axes(half_size)
     for angle, axis in product(ASKEW, axes):
         along = rotation_about_vertical(angle) @ axis
         room = _room(turned @ along, to_walls)
@@ -186,7 +187,8 @@ def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> Closing:
 def _room(along: Vector, to_walls: Vector) -> float:
     """Return the palm's room beside the walls when the fingers close ``along`` (3,) [m]."""
     share = np.abs(along[:2])
-    room = to_walls - PALM_ALONG * share - PALM_ACROSS * share[::-1]
+    share_across = share[::-1]  # of the direction at right angles to it
+    room = to_walls - PALM_ALONG * share - PALM_ACROSS * share_across
     return float(np.min(room))
 
 
@@ -196,6 +198,6 @@ def _way_to_wall(along: Vector, to_walls: Vector) -> float:
     return float(np.min(to_walls / share))
 
 
-def _narrow(half: Vector) -> list[Vector]:
+def _graspable_axes(half_size: Vector) -> list[Vector]:
     """Return those horizontal axes (3,) along which an object of half this size (3,) [m] can be gripped."""
-    return [np.eye(3)[axis] for axis in (0, 1) if half[axis] < NARROW]
+    return [np.eye(3)[axis] for axis in (0, 1) if half_size[axis] < NARROW]

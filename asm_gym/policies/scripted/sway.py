@@ -81,7 +81,7 @@ def _is_finite_box(space: gym.Space[Any]) -> TypeGuard[gym.spaces.Box]:
     return bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
 
 
-class Arm(Swaying):
+class SyntheticArmExpert(Swaying):
     """The synthetic arm goes through four poses, a second each, and sways a little on the way."""
 
     NOISE = 0.0

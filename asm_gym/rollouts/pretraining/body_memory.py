@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.data.crashes import CRASH, peak_force, peak_torques
-from asm_gym.data.episode import Episode, spans
+from asm_gym.data.episode import Episode
 from asm_gym.detection.conformal import HOUR
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.monitor_protocol import Progress
+from asm_gym.readings import spans
 from asm_gym.spec import StreamSpec
 
 MOTION_KEY = "lesson"  # under which a recording's ``info`` has its training motion
