@@ -205,8 +205,10 @@ def _check_parameter(parameter: Field[Any], value: Any) -> None:
         check_numbers(name, value, 3, low=bounds["low"], high=bounds["high"])
         if name == "direction" and not np.linalg.norm(value) > 0:
             raise ValueError(f"direction must not be all zero, got {value}")
-    elif annotation == "str" and value != "":
-        check_text(name, value)
+    elif annotation == "str":
+        is_empty = isinstance(value, str) and not value  # the default: none is named
+        if not is_empty:
+            check_text(name, value)
 
 
 def steady_force(env: RobosuiteEnv, body: int, newtons: float, direction: Vector3) -> Edit:
