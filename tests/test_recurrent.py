@@ -11,9 +11,9 @@ from asm_gym.memory.recurrent import (
     Eligibility,
     Errors,
     RecurrentWeights,
+    Wiring,
     advance,
     direct,
-    direct_synapses,
     follow_eligibility,
     initial_recurrent_weights,
     local_change,
@@ -24,6 +24,7 @@ from asm_gym.memory.recurrent import (
 HIDDEN = 6
 SENSES = 3
 MOTOR = 2
+FELT = 1  # the sense that reaches no unit
 STREAMS = 4
 PRIOR = 2.0
 
@@ -34,10 +35,12 @@ def double(weights: RecurrentWeights) -> RecurrentWeights:
 
 def random_weights(rng: np.random.Generator) -> RecurrentWeights:
     weights = double(initial_recurrent_weights(HIDDEN, SENSES, MOTOR, rng))
-    exists = direct_synapses(HIDDEN, SENSES, MOTOR)
+    weights.reads[FELT] = 0.0
+    wiring = Wiring.of(weights)
     return weights._replace(
+        W_C=weights.W_C * wiring.W_C,
         W_F=rng.normal(size=weights.W_F.shape) / 3,
-        W_D=exists * rng.normal(size=weights.W_D.shape) / 4,
+        W_D=wiring.W_D * rng.normal(size=weights.W_D.shape) / 4,
     )
 
 
@@ -49,6 +52,7 @@ def local_total(
     inference = Inference(PRIOR, 1.0, PRIOR + norm**2, 4000)
     m = np.zeros((STREAMS, weights.W_C.shape[1]))
     eligible = Eligibility.none(STREAMS, weights)
+    wiring = Wiring.of(weights)
     total = {name: np.zeros(getattr(weights, name).shape) for name in Change._fields}
     for row in rows:
         action = np.ascontiguousarray(row[:, SENSES:])
@@ -56,7 +60,7 @@ def local_total(
         left = row[:, :-1] - direct(m, action, weights.W_D)
         z = infer(mu, left, weights.W_F, np.ones_like(left), inference)
         errors = Errors(PRIOR * (z - mu), left - sense(z, weights.W_F))
-        change = local_change(m, action, z, errors, eligible, weights)
+        change = local_change(m, action, z, errors, eligible, weights, wiring)
         for name in total:
             total[name] += getattr(change, name)
         if forget:
@@ -90,13 +94,15 @@ def gradient_through_time(weights: RecurrentWeights, rows: np.ndarray) -> dict[s
             z = z - 0.1 * (PRIOR * (z - mu) - (1 - f**2) * (error @ w["W_F"]))
         error = left - torch.tanh(z) @ w["W_F"].T
         energy = energy + 0.5 * (PRIOR * (z - mu) ** 2).sum() + 0.5 * (error**2).sum()
-        drive_re = w["gain"] * (row @ w["B_re"].T)
-        drive_im = w["gain"] * (row @ w["B_im"].T)
+        read = row * w["reads"]
+        drive_re = w["gain"] * (read @ w["B_re"].T)
+        drive_im = w["gain"] * (read @ w["B_im"].T)
         c_re, c_im = re * c_re - im * c_im + drive_re, re * c_im + im * c_re + drive_im
         last = row
     (-energy / STREAMS).backward()
-    mask = torch.tensor(direct_synapses(HIDDEN, SENSES, MOTOR))
-    w["W_D"].grad *= mask
+    wiring = Wiring.of(weights)
+    w["W_C"].grad *= torch.tensor(wiring.W_C)
+    w["W_D"].grad *= torch.tensor(wiring.W_D)
     return {name: w[name].grad.numpy() for name in Change._fields}
 
 

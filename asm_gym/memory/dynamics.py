@@ -63,8 +63,8 @@ DYNAMICS = {
         weights=RecurrentWeights,
         network=RecurrentNetwork,
         learn=learn_recurrent,
-        iterations=5,
-        prior_precision=30.0,
+        iterations=20,
+        prior_precision=1.0,
     ),
     TRACES: Dynamics(
         shapes=weight_shapes,

@@ -11,8 +11,9 @@
 
 No unit reads another, so the eligibility of a synapse is a number that the synapse itself keeps, and it is exact: with
 the weights held still, the sum of these changes over an episode is the gradient of F through all of its rows. γ scales
-each unit to a mean square of about 1 and is not learned. Noise on r while learning makes a network that acts stand its
-own deviations.
+each unit to a mean square of about 1 and is not learned. Senses that are *felt*, such as forces, reach no unit and no
+prediction but their own: what they tell of a touch must not move what acts. Noise on r while learning makes a network
+that acts stand its own deviations.
 
 Sources: Orvieto et al. 2023 (ICML) for the recurrence; Zucchet et al. 2023 (NeurIPS) for the exact eligibility of
 independent units; Millidge et al. 2024 (PLOS Comput Biol) for inference and learning; Jaeger 2001 (GMD Report 148) for
@@ -22,7 +23,6 @@ the noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,6 +54,10 @@ SHORTEST = 0.3  # |λ| of the most forgetful unit at first
 LONGEST = 0.995  # of the least forgetful one
 FASTEST = 0.3  # largest θ at first [rad a row]
 SLOWER = 1 / 3  # learning rate of ν and θ, in that of the weights
+LEARNING_PRIOR = (
+    30.0  # Π_z while learning: the larger, the closer to the gradient of the prediction error
+)
+LEARNING_ITERATIONS = 5
 
 
 class RecurrentWeights(NamedTuple):
@@ -65,6 +69,7 @@ class RecurrentWeights(NamedTuple):
     decay: Array  # (N,) ν
     turn: Array  # (N,) θ [rad a row]
     gain: Array  # (N,) γ; not learned
+    reads: Array  # (R,) 0 where a number of the row is felt, else 1; not learned
     B_re: Array
     B_im: Array
     W_C: Array  # (H, I) from what is carried on to the state
@@ -87,6 +92,7 @@ def recurrent_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[i
         "decay": (units,),
         "turn": (units,),
         "gain": (units,),
+        "reads": (row,),
         "B_re": (units, row),
         "B_im": (units, row),
         "W_C": (hidden, carried),
@@ -106,8 +112,9 @@ def multiplier(weights: RecurrentWeights, i: int) -> tuple[float, float]:
 def advance(m: Array, rows: Array, weights: RecurrentWeights) -> Array:
     """Return m_t (B, I) from m_{t-1} and the rows r_t (B, R)."""
     N = len(weights.decay)
-    drive_re = outward(rows, weights.B_re)
-    drive_im = outward(rows, weights.B_im)
+    read = rows * weights.reads
+    drive_re = outward(read, weights.B_re)
+    drive_im = outward(read, weights.B_im)
     out = np.empty_like(m)
     for i in range(N):
         re, im = multiplier(weights, i)
@@ -191,6 +198,7 @@ def follow_eligibility(
 ) -> None:
     """Advance the eligibility in place by the rows r_t (B, R), from m_{t-1} (B, I)."""
     N, R = weights.B_re.shape
+    read = rows * weights.reads
     for i in range(N):
         re, im = multiplier(weights, i)
         gain = weights.gain[i]
@@ -202,19 +210,33 @@ def follow_eligibility(
             for j in range(R):
                 E_re = eligible.B_re[n, i, j]
                 E_im = eligible.B_im[n, i, j]
-                eligible.B_re[n, i, j] = re * E_re - im * E_im + gain * rows[n, j]
+                eligible.B_re[n, i, j] = re * E_re - im * E_im + gain * read[n, j]
                 eligible.B_im[n, i, j] = re * E_im + im * E_re
 
 
 # ------------------------------------------------------------------ the network
 
 
-@lru_cache(maxsize=8)
-def direct_synapses(hidden: int, sensory: int, motor: int) -> Array:
-    """Return the mask (S + A, I + A + 1) of W_D: 0 from an action to its own prediction, else 1."""
-    exists = np.ones(recurrent_shapes(hidden, sensory, motor)["W_D"], np.float32)
-    exists[sensory:, exists.shape[1] - motor - 1 : -1] = 0.0
-    return exists
+class Wiring(NamedTuple):
+    """Which synapses exist: 1, else 0."""
+
+    W_C: Array  # (I,) from what is carried on
+    W_D: Array  # (S + A, I + A + 1)
+
+    @classmethod
+    def of(cls, weights: RecurrentWeights) -> Wiring:
+        """Return the wiring of weights: none from a felt number but to the felt, none from an action to itself."""
+        carried = weights.W_C.shape[1]
+        motor = weights.W_D.shape[1] - carried - 1
+        predicted = len(weights.W_F)
+        units = 2 * len(weights.decay)
+        from_carried = np.ones(carried, np.float32)
+        from_carried[units:] = weights.reads
+        to_prediction = np.ones(weights.W_D.shape, np.float32)
+        is_felt = weights.reads[:predicted] == 0
+        to_prediction[~is_felt, :carried] = from_carried
+        to_prediction[predicted - motor :, carried:-1] = 0.0
+        return cls(from_carried, to_prediction)
 
 
 def direct(m: Array, u: Array, W_D: Array) -> Array:
@@ -347,6 +369,7 @@ def initial_recurrent_weights(
     forgetting = np.geomspace(-np.log(SHORTEST), -np.log(LONGEST), units)
     weights = RecurrentWeights._make(np.zeros(shape, np.float32) for shape in shapes.values())
     weights.decay[:] = np.log(forgetting)
+    weights.reads[:] = 1.0
     weights.turn[:] = rng.uniform(0.0, FASTEST, units)
     weights.gain[:] = np.sqrt(1 - np.exp(-2 * forgetting))
     for part in (weights.B_re, weights.B_im):
@@ -364,20 +387,23 @@ class Errors(NamedTuple):
 
 
 def local_change(
-    m: Array, u: Array, z: Array, errors: Errors, eligible: Eligibility, weights: RecurrentWeights
+    m: Array,
+    u: Array,
+    z: Array,
+    errors: Errors,
+    eligible: Eligibility,
+    weights: RecurrentWeights,
+    wiring: Wiring,
 ) -> Change:
     """Apply the local learning rules to ``m`` (B, I), action and 1 ``u`` (B, A + 1) and the state ``z`` (B, H)."""
-    motor = u.shape[1] - 1
-    hidden = z.shape[1]
     carried = m.shape[1]
     downhill = errors.state @ weights.W_C + errors.row @ weights.W_D[:, :carried]  # (B, I)
     recurrent = recurrent_change(downhill, eligible, weights)
-    exists = direct_synapses(hidden, errors.row.shape[1] - motor, motor)
     return Change(
         **recurrent._asdict(),
-        W_C=coincidence(errors.state, m),
+        W_C=coincidence(errors.state, m) * wiring.W_C,
         W_F=coincidence(errors.row, activate(z)),
-        W_D=coincidence(errors.row, np.hstack([m, u])) * exists,
+        W_D=coincidence(errors.row, np.hstack([m, u])) * wiring.W_D,
     )
 
 
@@ -394,6 +420,7 @@ class RecurrentLearner(Learner):
     ) -> None:
         super().__init__(weights, schedule, rng)
         self.rng = rng
+        self.wiring = Wiring.of(weights)
         self.eligible = Eligibility.none(schedule.batch_size, weights)
 
     def at_rest(self, size: int) -> Array:
@@ -429,7 +456,7 @@ class RecurrentLearner(Learner):
             expected = past + sense(mu, w.W_F)
             senses = np.where(turn.alone, expected[:, :sensory], turn.senses)
         errors = Errors(pi_z * (z - mu), pi_x * error)
-        self.learn(local_change(state, taken, z, errors, self.eligible, w), rate)
+        self.learn(local_change(state, taken, z, errors, self.eligible, w, self.wiring), rate)
 
         rows = np.hstack([senses, taken])
         if self.schedule.noise > 0:
@@ -445,10 +472,25 @@ def learn_recurrent(
     schedule: Schedule,
     rng: np.random.Generator,
     tick: Tick,
+    felt: NDArray[np.bool_] | None = None,
 ) -> Trained:
-    """Learn the synapses through time; see ``temporal.Learn``."""
+    """Learn the synapses through time; see ``temporal.Learn``. ``felt`` (S,) says which senses are; by default none."""
     sensory = trajectories[0].senses.shape[1]
     motor = trajectories[0].commands.shape[1] - 1
     weights = initial_recurrent_weights(hidden, sensory, motor, rng)
-    learner = RecurrentLearner(weights, schedule, rng)
-    return learned_network(RecurrentNetwork, learner, trajectories, rng, tick)
+    if felt is not None:
+        weights.reads[:sensory] = ~felt
+        weights.W_C[:] *= Wiring.of(weights).W_C
+    near_gradient = schedule._replace(
+        prior_precision=LEARNING_PRIOR, iterations=LEARNING_ITERATIONS
+    )
+    learner = RecurrentLearner(weights, near_gradient, rng)
+    trained = learned_network(RecurrentNetwork, learner, trajectories, rng, tick)
+    in_use = RecurrentNetwork(
+        weights,
+        trained.network.association,
+        schedule.iterations,
+        schedule.prior_precision,
+        schedule.sensory_precision,
+    )
+    return trained._replace(network=in_use)

@@ -28,12 +28,12 @@ class MemoryConfig:
 
     Args:
         iterations: largest number of inference steps; inference ends earlier when the state stops changing. By default
-            20 on every row with settling, else 5 in learning and with a missing sense: a complete row needs none.
+            20 (5 with traces). Settling infers on every row, the others only in learning and with a missing sense.
         learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H for
             larger H, so that the input of a unit does not change faster with more synapses.
         batch_size: episodes in a batch of learning.
-        prior_precision: Π_z, trust in the prediction. By default 1 with settling, where the senses must move the state,
-            else 30: a higher value brings local learning closer to the gradient.
+        prior_precision: Π_z, trust in the prediction. By default 1, so that the senses move the state, and 30 with
+            traces: a higher value brings local learning closer to the gradient. Recurrent units always learn with 30.
         sensory_precision: Π_x, trust in the senses.
         noise: standard deviation of the noise on what recurrent units carry on while they learn, in standardised rows;
             0.3 for a memory that acts or runs on alone. The other networks learn without.

@@ -86,8 +86,8 @@ CLAIMS = (
     ),
     Claim(
         "predictive surprise across the repertoire",
-        "AUROC of its own energy",
-        lambda of, network: of("AUROC", network, at=FAULTS),
+        "AUROC of its own energy, where an ideal observer sees the fault",
+        lambda of, network: of(SEEN, network, at=FAULTS),
         bound=0.8,
     ),
     Claim(
