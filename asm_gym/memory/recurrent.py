@@ -466,6 +466,11 @@ class RecurrentLearner(Learner):
         return advance(state, rows, w), energy
 
 
+def near_gradient(schedule: Schedule) -> Schedule:
+    """Return the schedule with the inference of learning in the place of that in use."""
+    return schedule._replace(prior_precision=LEARNING_PRIOR, iterations=LEARNING_ITERATIONS)
+
+
 def learn_recurrent(
     trajectories: Sequence[Trajectory],
     hidden: int,
@@ -481,10 +486,7 @@ def learn_recurrent(
     if felt is not None:
         weights.reads[:sensory] = ~felt
         weights.W_C[:] *= Wiring.of(weights).W_C
-    near_gradient = schedule._replace(
-        prior_precision=LEARNING_PRIOR, iterations=LEARNING_ITERATIONS
-    )
-    learner = RecurrentLearner(weights, near_gradient, rng)
+    learner = RecurrentLearner(weights, near_gradient(schedule), rng)
     trained = learned_network(RecurrentNetwork, learner, trajectories, rng, tick)
     in_use = RecurrentNetwork(
         weights,

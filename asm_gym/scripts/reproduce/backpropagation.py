@@ -115,16 +115,21 @@ class Training:
 
 
 def train(
-    trajectories: Sequence[Trajectory], settings: Training, rng: np.random.Generator
+    trajectories: Sequence[Trajectory],
+    settings: Training,
+    rng: np.random.Generator,
+    network: Recurrent | None = None,
 ) -> Recurrent:
-    """Return a network that has learned from whole episodes."""
+    """Return a network that has learned from whole episodes; by default a new one."""
     torch.set_num_threads(1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         noise_generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
         sensory = trajectories[0].senses.shape[1]
         motor = trajectories[0].commands.shape[1] - 1
-        network = Recurrent(settings.hidden, sensory, motor, settings.cell)
+        if network is None:
+            network = Recurrent(settings.hidden, sensory, motor, settings.cell)
+    network.train().requires_grad_(True)
     optimiser, schedule = adam(network, settings.updates, settings.rate)
 
     done = 0

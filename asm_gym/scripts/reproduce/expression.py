@@ -66,6 +66,21 @@ class LocalTraining:
     noise: float = 0.0
 
 
+def schedule_of(settings: LocalTraining, rows: int) -> Schedule:
+    """Return the schedule of a network that learns from so many rows."""
+    dynamics = DYNAMICS[settings.dynamics]
+    return Schedule(
+        epochs=max(1, round(settings.steps * BATCH / rows)),
+        batch_size=BATCH,
+        learning_rate=settings.rate,
+        iterations=dynamics.iterations,
+        prior_precision=dynamics.prior_precision,
+        sensory_precision=1.0,
+        free_running_probability=settings.free_running,
+        noise=settings.noise,
+    )
+
+
 @dataclass(frozen=True)
 class Expresser(ABC):
     """A network that expresses skills, and how it reads rows."""
@@ -91,18 +106,8 @@ class ExpressionMemory(Expresser):
     ) -> ExpressionMemory:
         """Learn from whole episodes without labels."""
         reader = fit_reader(episodes)
-        dynamics = DYNAMICS[settings.dynamics]
-        schedule = Schedule(
-            epochs=max(1, round(settings.steps * BATCH / sum(map(len, episodes)))),
-            batch_size=BATCH,
-            learning_rate=settings.rate,
-            iterations=dynamics.iterations,
-            prior_precision=dynamics.prior_precision,
-            sensory_precision=1.0,
-            free_running_probability=settings.free_running,
-            noise=settings.noise,
-        )
-        learn = dynamics.learn
+        schedule = schedule_of(settings, sum(map(len, episodes)))
+        learn = DYNAMICS[settings.dynamics].learn
         if settings.dynamics == TRACES:
             learn = partial(learn_traces, gain=settings.gain)
         taught = trajectories(reader, episodes)
