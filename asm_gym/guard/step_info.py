@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -133,9 +134,7 @@ def asm_info(
         "cause": deepcopy(response.cause),
         "response": response.name,
         "case": response.case,
-        "severity": {
-            name: value if value == value else None for name, value in severity_info(now).items()
-        },
+        "severity": _none_for_nan(severity_info(now)),
         "executed_action": deepcopy(executed),
         "attribution": dict(
             zip(spec.labels, most_surprising.attribution[robot].tolist(), strict=True)
@@ -146,6 +145,15 @@ def asm_info(
     }
     info.update(step)  # type: ignore[typeddict-item]
     return info
+
+
+def _none_for_nan(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values, with None for those that are not known."""
+    known = dict(values)
+    for name, value in values.items():
+        if math.isnan(value):
+            known[name] = None
+    return known
 
 
 def _any(rows: Sequence[RowReport], field: str, robot: int) -> bool:
