@@ -183,7 +183,15 @@ def test_a_publisher_that_falls_silent_leaves_its_numbers_missing_and_another_on
     [
         (
             ["time,q_0,q_1,torque", "1,2,3,4"],
-            "line 1 is no row of numbers, and no header: the memory reads channels that are not there: cmd",
+            "line 1 is another robot's header: the memory reads channels that are not there: cmd",
+        ),
+        (
+            [*csv_lines()[:2], "time,a,b"],
+            "line 3 is another robot's header: .* not there: .*q.*; there are.*: a, b",
+        ),
+        (
+            ["nothing but words"],
+            "line 1 is no row of numbers, and no header",
         ),
         (
             ["q_0,q_0,q_1,torque,cmd", "1,1,3,4,5", "1,2,3,4,5"],

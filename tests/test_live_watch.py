@@ -459,6 +459,18 @@ def test_a_header_of_a_stray_sender_does_not_make_the_watch_deaf(monitor):
     assert f"{len(csv_rows)} rows" in said
 
 
+def test_a_pipe_of_another_robot_is_refused_by_the_names_that_its_header_lacks(
+    monitor, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("sys.stdin", io.StringIO("time,q[0],q[1],grip\n0,1,2,3\n"))
+    monitor.save(tmp_path / "m.asm")
+    assert main(["watch", "-", "--monitor", str(tmp_path / "m.asm")]) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "another robot's header: " in line
+    assert "torque, cmd" in line
+    assert "grip" in line
+
+
 @pytest.mark.parametrize(
     "line",
     [

@@ -2,13 +2,16 @@
 
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import ClipAction, RescaleAction, TransformAction
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed_map import HandSpeedMap
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.chunk_preview import preview_chunk
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -168,3 +171,71 @@ def test_a_lerobot_chunk_is_held_against_the_range_of_healthy_commands():
     assert guard.preview(rest, [rest, {MOTORS[0]: 0.0}]).at == 1
     with pytest.raises(ValueError, match="chunk"):
         guard.preview(rest, [])
+
+
+class Halved(gym.ActionWrapper):
+    """Changes actions, and no one knows how."""
+
+    def action(self, action):
+        return 0.5 * action
+
+
+def height(numbers):
+    """An action of one number as one of the arm: up and down."""
+    return np.insert(np.zeros(6, np.float32), 2, numbers[0])
+
+
+UPWARDS = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+def guarded(env, memory):
+    env = NeuralASMSafety(env, memory, "monitor")
+    env.reset(seed=0)
+    return env
+
+
+def test_a_preview_judges_actions_as_wrappers_inside_change_them(memory, lift):
+    single = DOWN[:, 2:3]  # (16, 1)
+    plain = guarded(lift, memory).preview(DOWN)
+    assert plain.at is not None
+    assert guarded(ClipAction(lift), memory).preview(DOWN).at == plain.at
+    assert guarded(TransformAction(lift, height, UPWARDS), memory).preview(single).at == plain.at
+    wide = guarded(RescaleAction(lift, np.float32(-10.0), np.float32(10.0)), memory)
+    assert wide.preview(10.0 * DOWN)[:3] == plain[:3]
+    assert wide.preview(0.1 * DOWN).at != plain.at
+    turned = TransformAction(lift, np.negative, lift.action_space)
+    assert guarded(turned, memory).preview(UP)[:3] == plain[:3]
+
+
+def test_a_preview_judges_actions_as_wrappers_outside_change_them(memory, lift):
+    guard = guarded(lift, memory)
+    plain = guard.preview(DOWN)
+    outer = RescaleAction(guard, np.float32(-10.0), np.float32(10.0))
+    told = guard.preview(10.0 * DOWN, outer)
+    assert told[:3] == plain[:3]
+    np.testing.assert_array_equal(told.kept, 10.0 * DOWN)
+    outer = TransformAction(guard, height, UPWARDS)
+    assert guard.preview(DOWN[:, 2:3], outer)[:3] == plain[:3]
+    with pytest.raises(ValueError, match="not the environment around this guard"):
+        guard.preview(DOWN, lift)
+
+
+def test_a_preview_refuses_what_it_cannot_know(memory, lift):
+    with pytest.raises(UnsupportedEnvironment, match=r"Halved changes actions.*TransformAction"):
+        guarded(Halved(lift), memory).preview(DOWN)
+    guard = guarded(lift, memory)
+    with pytest.raises(UnsupportedEnvironment, match="Halved changes actions"):
+        guard.preview(DOWN, Halved(guard))
+
+
+def test_a_preview_refuses_actions_of_another_size_than_the_memory_reads():
+    known = SimpleNamespace(spec=HAND, commands_=np.zeros((3, 2), np.float32))
+    with pytest.raises(UnsupportedEnvironment, match=r"hold 3 numbers.* 2 commands"):
+        preview_chunk(np.zeros((4, 3), np.float32), path(0.2)[0], np.zeros(3), known, HAND.dt)
+
+
+def test_a_number_that_is_not_finite_ends_a_chunk_whatever_wrappers_make_of_it(memory, lift):
+    mended = TransformAction(lift, np.nan_to_num, lift.action_space)
+    chunk = UP.astype(np.float32)
+    chunk[3, 5] = np.inf
+    assert guarded(mended, memory).preview(chunk)[:2] == (3, "no action")

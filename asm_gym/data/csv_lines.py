@@ -41,6 +41,12 @@ class CsvLines:
         self._named = named_columns(self.names)
 
     @property
+    def is_of_words(self) -> bool:
+        """Whether it is a header for certain: words behind separators, and no number."""
+        has_numbers = self.dialect.count_numbers(self.names)
+        return self.dialect.separator != " " and len(self.names) > 1 and not has_numbers
+
+    @property
     def names_all_columns(self) -> bool:
         """Whether the header names all columns, and no cell does."""
         has_key = any(map(is_key, self.names))

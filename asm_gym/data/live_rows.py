@@ -28,6 +28,10 @@ from asm_gym.data.schema import LogSchema
 from asm_gym.data.table_layout import MOST_COLUMNS
 from asm_gym.data.text_files import flat_row
 
+# What a line that is no row is.
+NO_ROW = "no row of numbers"
+OTHER_HEADER = "another robot's header"
+
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
     """Nothing came for longer than a source may be silent."""
@@ -125,14 +129,14 @@ class RowReader:
         try:
             return self._row_of(line)
         except Exception as error:  # anybody may have sent it: deep, huge or broken
-            if self._begins_anew(line):
-                return None
-            return self._problem(error)
+            header = _header_in(line)
+            if header is None:
+                return self._problem(error)
+            return self._begin_anew(header, error)
 
-    def _problem(self, error: Exception) -> Row:
+    def _problem(self, error: Exception, kind: str = NO_ROW) -> Row:
         """Return a line that is no row."""
-        kind = "no row of numbers"
-        if self._csv is None and not self._is_known:
+        if kind == NO_ROW and self._csv is None and not self._is_known:
             kind += ", and no header"
         missing = np.full(self._spec.size, np.nan)
         return Row(numbers=missing, read=False, problem=f"line {self.line} is {kind}: {error}")
@@ -195,18 +199,22 @@ class RowReader:
         self._csv = csv
         return True
 
-    def _begins_anew(self, line: str) -> bool:
-        """Return whether a line is another header with all columns of the schema, and take it up."""
-        if _is_json(line) or line.count(",") > MOST_COLUMNS:
-            return False
+    def _begin_anew(self, header: CsvLines, error: Exception) -> Row | None:
+        """Take up a header with all columns of the schema; return any other as a line that is no row.
+
+        Args:
+            header: the line, read as a header.
+            error: why it is no row.
+        """
         try:
-            csv = CsvLines(line)
-            ColumnMatch(self._schema, csv.names)
-        except Exception:  # csv.Error is no ValueError, and no line may end a watch
-            return False
-        self._csv = csv
+            ColumnMatch(self._schema, header.names)
+        except Exception as lacking:  # no line may end a watch
+            if header.is_of_words:
+                return self._problem(lacking, OTHER_HEADER)
+            return self._problem(error)
+        self._csv = header
         self._match = None
-        return True
+        return None
 
     def _reading(self, line: str) -> _Reading | None:
         """Return the numbers and the stamp of a row; None if more of it is to come."""
@@ -286,6 +294,16 @@ class RowReader:
         self._match = match
         self._lacking = None
         return True
+
+
+def _header_in(line: str) -> CsvLines | None:
+    """Return a line read as a header; None of what can be none."""
+    if _is_json(line) or line.count(",") > MOST_COLUMNS:
+        return None
+    try:
+        return CsvLines(line)
+    except Exception:  # csv.Error is no ValueError, and no line may end a watch
+        return None
 
 
 def _is_json(line: str) -> bool:

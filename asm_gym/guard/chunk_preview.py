@@ -19,6 +19,7 @@ from asm_gym.detection.commands import PACE, PLACE, hands_of, out_of_range
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.detection.hand_speed_map import HandSpeedMap
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.robot_table import Floats32
 from asm_gym.validation import as_float32
 
@@ -47,6 +48,11 @@ def checked_chunk(actions: Any, shape: tuple[int, ...]) -> Floats32:
     return chunk
 
 
+def one_row_each(actions: NDArray[Any]) -> NDArray[Any]:
+    """Return actions (k, ...) as rows (k, A)."""
+    return actions.reshape(len(actions), -1)
+
+
 def preview_chunk(
     chunk: Floats32,
     row: NDArray[np.floating[Any]],
@@ -64,10 +70,22 @@ def preview_chunk(
         monitor: holds the chunk against what it was calibrated on.
         dt: control period [s].
         limits: slow hands down; None for no limits.
+
+    Raises:
+        UnsupportedEnvironment: the memory reads actions of another size.
     """
-    speed_map = _speed_map(monitor, limits)
-    commands = getattr(monitor, "commands_", None)
+    speed_map = None
+    commands = None
+    commanded = monitor.spec.motor.size
+    if commanded:
+        speed_map = _speed_map(monitor, limits)
+        commands = getattr(monitor, "commands_", None)
     known = speed_map is not None or commands is not None
+    if known and chunk.shape[1] != commanded:
+        raise UnsupportedEnvironment(
+            f"actions hold {chunk.shape[1]} numbers, and the memory reads {commanded} commands",
+            advice="preview() needs a memory of these actions, by asm-gym fit",
+        )
     sensed = row.astype(np.float64)[hands_of(monitor.spec)]  # (H, 2, 3)
     hands = Hands(
         places=sensed[:, 0],

@@ -12,7 +12,7 @@ The state of the robots is one table, ``robot_table.ROBOT``. Each stage is enter
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from asm_gym.detection.alarm_rule import FAULT_EVENT, KNOCK_EVENT
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.alarm_terms import BY_CAUSE, CONTACT, SURPRISE, AlarmTerms
 from asm_gym.guard.arbiter import Arbiter
-from asm_gym.guard.chunk_preview import Preview, preview_chunk
+from asm_gym.guard.chunk_preview import Preview, one_row_each, preview_chunk
 from asm_gym.guard.commander import Command, Commander, Observe
 from asm_gym.guard.contact_state import no_load
 from asm_gym.guard.diagnostician import Diagnostician
@@ -213,16 +213,35 @@ class Guard:
         """Tell the monitor that the last rows (n, D) were these: something else was commanded than it seemed."""
         self._observer.amend(rows)
 
-    def preview(self, robot: int, chunk: Floats32, row: Floats32, last: Floats32) -> Preview:
-        """Return what becomes of a robot's chunk of actions (k, A), after a row (D,) and the action (A,) done last."""
+    def preview(
+        self,
+        robot: int,
+        chunk: Floats32,
+        row: Floats32,
+        last: Floats32,
+        as_streamed: Callable[[Floats32], Floats32] = one_row_each,
+    ) -> Preview:
+        """Return what becomes of a robot's chunk of actions.
+
+        Args:
+            robot: its number.
+            chunk: (k, ...) actions as the robot's policy gives them.
+            row: (D,) sensed before it.
+            last: the action that was done last.
+            as_streamed: returns actions (k, A) as the stream would tell them.
+        """
         facts = self._facts
         limits = self.limits[robot]
-        clipped = np.clip(chunk, facts.low, facts.high)
-        clipped = np.where(np.isfinite(chunk), clipped, chunk)
+        is_finite = np.isfinite(chunk)
+        shape = chunk.shape[1:]
+        clipped = np.clip(chunk, facts.low.reshape(shape), facts.high.reshape(shape))
+        streamed = np.array(as_streamed(np.where(is_finite, clipped, np.float32(np.nan))))
+        streamed[~one_row_each(is_finite).all(axis=1)] = np.nan  # whatever wrappers make of it
+        last = as_streamed(last.reshape(1, *shape))[0]
         slows = limits is not None and np.isfinite(limits.hand_speed) and facts.limits_contact
         if not slows:
             limits = None
-        preview = preview_chunk(clipped, row, last, self.fitted.monitor, facts.dt, limits)
+        preview = preview_chunk(streamed, row, last, self.fitted.monitor, facts.dt, limits)
         if self._on_alarm == "monitor":
             return preview._replace(kept=chunk)
         return preview._replace(kept=chunk[: preview.at])

@@ -54,6 +54,7 @@ def parallel_map(
         ValueError: fewer than one worker, or more than ``MOST_WORKERS``. What a task raises is raised here.
         TypeError: the task cannot be sent to another process.
         ChildProcessError: a process was killed.
+        OSError: /dev/shm cannot be written to, or is full.
     """
     check_number("workers", workers, low=1, high=MOST_WORKERS, whole=True)
     report = progress or (lambda done, total: None)
@@ -94,13 +95,14 @@ def _call(task: bytes, item: Any) -> Any:
 @contextmanager
 def _loky(workers: int) -> Iterator[Any]:
     loky = require("loky", what="running episodes in several processes")
-    executor = loky.get_reusable_executor(
-        workers,
-        timeout=IDLE_S,
-        initializer=_end_with_parent,
-        initargs=(os.getpid(),),
-        env=ONE_THREAD,
-    )
+    with semaphores_needed():
+        executor = loky.get_reusable_executor(
+            workers,
+            timeout=IDLE_S,
+            initializer=_end_with_parent,
+            initargs=(os.getpid(),),
+            env=ONE_THREAD,
+        )
     try:
         yield executor
     except BrokenProcessPool as error:
@@ -111,6 +113,18 @@ def _loky(workers: int) -> Iterator[Any]:
         # after an error or a Ctrl-C nothing runs on
         executor.shutdown(wait=True, kill_workers=True)
         raise
+
+
+@contextmanager
+def semaphores_needed() -> Iterator[None]:
+    """Say what is missing where a block cannot make the semaphores of worker processes."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(
+            f"worker processes need semaphores in /dev/shm, and none can be made there ({error}): "
+            "mount it writable and not full, or set workers to 1"
+        ) from error
 
 
 def _end_with_parent(parent: int) -> None:

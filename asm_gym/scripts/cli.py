@@ -8,6 +8,7 @@ from typing import Any
 
 from asm_gym.extras import needed_for
 from asm_gym.scripts.command import DONE, exit_code
+from asm_gym.scripts.shortage import check_address_space
 from asm_gym.validation import check_choice
 from asm_gym.version import __version__
 
@@ -51,6 +52,8 @@ def main(argv: list[str] | None = None) -> int:
 
     def work() -> int:
         check_choice("command", name, COMMANDS)
+        if name != "doctor":
+            check_address_space()
         with needed_for("this command"):
             module: Any = import_module(f"asm_gym.scripts.{MODULES.get(name, name)}")
         return module.main(rest)

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
 import gymnasium as gym
 
+from asm_gym.scripts.shortage import shortage_of
 from asm_gym.validation import check_choice
 from asm_gym.version import __version__
 
@@ -235,10 +236,13 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
     except BrokenPipeError:  # the reader of our output has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except USAGE_ERRORS as error:
-        if sys.flags.dev_mode:
+    except Exception as error:
+        message = shortage_of(error)
+        if not message and isinstance(error, USAGE_ERRORS):
+            message = one_line(error)
+        if sys.flags.dev_mode or not message:
             raise
-        print(f"{prog}: {one_line(error)}", file=sys.stderr)
+        print(f"{prog}: {message}", file=sys.stderr)
         return REFUSED
 
 

@@ -24,6 +24,7 @@ from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.row_kernel import observe_rows
+from asm_gym.rollouts.parallel import semaphores_needed
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.spec import Channel, StreamSpec
@@ -38,10 +39,9 @@ class Args:
 def warm_up(args: Args, console: Console) -> None:
     """Compile memory and simulation in two processes (plain ones: the core has no loky), and print where it is kept."""
     start = time.perf_counter()
-    with (
-        stage("compiling", console) as progress,
-        ProcessPoolExecutor(2, get_context("spawn")) as processes,
-    ):
+    with semaphores_needed():
+        executor = ProcessPoolExecutor(2, get_context("spawn"))
+    with stage("compiling", console) as progress, executor as processes:
         parts = [processes.submit(_compile_memory), processes.submit(_compile_simulation)]
         for done, part in enumerate(as_completed(parts), 1):
             part.result()

@@ -9,9 +9,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
+from asm_gym.control_period import stream_provider
 from asm_gym.exceptions import UnsupportedEnvironment
+from asm_gym.guard.action_path import passed_on
 from asm_gym.guard.adapter import SensedRows
-from asm_gym.guard.chunk_preview import Preview, checked_chunk
+from asm_gym.guard.chunk_preview import Preview, checked_chunk, one_row_each
 from asm_gym.guard.commander import Command
 from asm_gym.guard.robot_table import Floats32
 from asm_gym.guard.step_info import AsmInfo, LazyInfo, RowReport, asm_info
@@ -152,25 +154,44 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self.report_step([report], info)
         return observation, info
 
-    def preview(self, actions: Any) -> Preview:
+    def preview(self, actions: Any, env: gym.Env[Any, Any] | None = None) -> Preview:
         """Return which action of a chunk (k, A) should not be executed and why, before the first is.
 
         Execute ``kept``, the actions before it (all of them under ``"monitor"``), then ask the policy again. Meanwhile
-        ``info["asm"]["preview"]`` counts down to that action. Raises ValueError for a chunk of another shape.
+        ``info["asm"]["preview"]`` counts down to that action. Actions are judged as they reach the robot, through
+        ClipAction, RescaleAction and any other TransformAction.
+
+        Args:
+            actions: (k, A) the chunk.
+            env: the outermost environment, where wrappers outside of this guard change actions: the chunk is of
+                its actions. By default it is of the guard's.
+
+        Raises:
+            ValueError: a chunk of another shape.
+            UnsupportedEnvironment: a wrapper changes actions in an unknown way, or the memory reads actions of
+                another size.
         """
         if self._ended or self._box is None:
             raise gym.error.ResetNeeded("preview() needs a running episode and a Box action space")
-        chunk = checked_chunk(actions, self._box.shape)
+        outermost = env or self
+        chunk = checked_chunk(actions, outermost.action_space.shape or ())
+        own_chunk = checked_chunk(passed_on(chunk, outermost, self), self._box.shape)
         row = self._row
         if row is None:
             row = self._source.first(self._observation, self._first_info)
         last = self._facts.rest
         if self._executed.size:
-            last = self._executed.ravel()
-        preview = self.guard.preview(0, chunk.reshape(len(chunk), -1), row, last)
+            last = self._executed
+        preview = self.guard.preview(0, own_chunk, row, last, self._as_streamed)
         self._preview = preview._replace(kept=chunk[: len(preview.kept)])
         self._previewed_actions = len(chunk)
         return self._preview
+
+    def _as_streamed(self, actions: Floats32) -> Floats32:
+        """Return actions (k, *shape) as the stream tells them (k, A), behind the wrappers in this guard."""
+        if self._source.own:
+            actions = passed_on(actions, self.env, stream_provider(self.env))
+        return one_row_each(actions)
 
     def step(self, action: Any) -> StepResult:
         if self._ended:
