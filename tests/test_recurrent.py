@@ -60,7 +60,9 @@ def local_total(
         left = row[:, :-1] - direct(m, action, weights.W_D)
         z = infer(mu, left, weights.W_F, np.ones_like(left), inference)
         errors = Errors(PRIOR * (z - mu), left - sense(z, weights.W_F))
-        change = local_change(m, action, z, errors, eligible, weights, wiring)
+        change = local_change(
+            m=m, u=action, z=z, errors=errors, eligible=eligible, weights=weights, wiring=wiring
+        )
         for name in total:
             total[name] += getattr(change, name)
         if forget:

@@ -456,7 +456,16 @@ class RecurrentLearner(Learner):
             expected = past + sense(mu, w.W_F)
             senses = np.where(turn.alone, expected[:, :sensory], turn.senses)
         errors = Errors(pi_z * (z - mu), pi_x * error)
-        self.learn(local_change(state, taken, z, errors, self.eligible, w, self.wiring), rate)
+        change = local_change(
+            m=state,
+            u=taken,
+            z=z,
+            errors=errors,
+            eligible=self.eligible,
+            weights=w,
+            wiring=self.wiring,
+        )
+        self.learn(change, rate)
 
         rows = np.hstack([senses, taken])
         if self.schedule.noise > 0:
