@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.monitors import NeuralASM
+from asm_gym.guard.live_watch import follow
+from asm_gym.monitors import NeuralASM, load_monitor
+from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import swing
 
@@ -120,3 +122,12 @@ def test_ten_thousand_rows_a_second_while_nobody_reads(seconds, latest_s, memory
     assert np.median(late_s) < SOON_S
     assert max(late_s) < latest_s
     assert memory_kb[1] - memory_kb[0] < MOST_GROWTH_KB
+
+
+def test_a_watch_spends_no_time_on_causes_that_it_does_not_print(memory, monkeypatch):
+    asked = []
+    monkeypatch.setattr(Diagnosis, "__call__", lambda *args: asked.append(args))
+    events = []
+    assert follow(b"".join(blocks()).decode().splitlines(), load_monitor(memory), events.append)
+    assert events[0].reason == "surprise"
+    assert not asked

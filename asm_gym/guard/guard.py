@@ -61,6 +61,7 @@ class Guard:
         options: what the guard is told.
         policies: the user's own, one for each robot, where ``options`` name no reflex.
         rows_per_step: rows of the stream in a control step.
+        explains: find the cause of each alarm, which takes longer than to judge its row.
 
     Attributes:
         table: the records of the robots.
@@ -81,9 +82,12 @@ class Guard:
         options: GuardOptions,
         policies: Sequence[Policy] = (),
         rows_per_step: int = 1,
+        explains: bool = True,
     ) -> None:
         spec = monitor.spec
-        diagnosis = diagnosis_of(monitor)
+        diagnosis = None
+        if explains:
+            diagnosis = diagnosis_of(monitor)
         reaction = options.reaction(diagnosis is not None)
         self._on_alarm = ""  # a policy of the user's own acts
         if isinstance(reaction, str):

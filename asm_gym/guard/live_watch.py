@@ -135,7 +135,7 @@ class LiveWatch(Adapter):
         schema = settings.schema or LogSchema.kept_in(getattr(monitor, "about", {}), spec)
         self._reader = RowReader(schema, settings.clock, settings.silence_s)
         options = GuardOptions("monitor", contact_limits=None)
-        self._guard = Guard(RobotFacts.unknown(spec), monitor, options)
+        self._guard = Guard(RobotFacts.unknown(spec), monitor, options, explains=False)
         self._no_action = np.zeros((1, spec.motor.size), np.float32)
         self._beat = settings.beat
         self._stamp: float | None = None  # of the newest row, by the robot's own clock [s]
