@@ -171,6 +171,8 @@ def test_a_lerobot_chunk_is_held_against_the_range_of_healthy_commands():
     assert guard.preview(rest, [rest, {MOTORS[0]: 0.0}]).at == 1
     with pytest.raises(ValueError, match="chunk"):
         guard.preview(rest, [])
+    with pytest.raises(ValueError, match=r"knows no action called tail\.pos"):
+        guard.preview(rest, [rest, {**rest, "tail.pos": 1e30}])
 
 
 class Halved(gym.ActionWrapper):

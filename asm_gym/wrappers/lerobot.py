@@ -140,11 +140,12 @@ class LeRobotGuard(Adapter):
         Execute ``actions[:at]``, then ask the policy again.
 
         Raises:
-            ValueError: a chunk without an action.
+            ValueError: a chunk without an action, or names that the memory does not know.
         """
         if not len(actions):
             raise ValueError("a chunk needs at least one action, got none")
-        guard = self._guard_for(actions[0])
+        for action in actions:
+            guard = self._guard_for(action)
         chunk = np.concatenate([self._numbers(action) for action in actions])  # (k, A)
         row = row_of(LoopStep(observation, self._sent), self._columns)[0]
         return guard.preview(0, chunk, row, self._numbers(self._sent)[0])
