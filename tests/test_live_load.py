@@ -116,7 +116,6 @@ def test_ten_thousand_rows_a_second_while_nobody_reads(seconds, memory, tmp_path
     reasons = [json.loads(text)["reason"] for _, text in events]
     assert reasons.count("surprise") == seconds * RATE // CYCLE
     assert taken > 0.9 * RATE
-    assert np.median(late_s) < SOON_S
     assert max(late_s) < LATEST_S
     assert memory_kb[1] - memory_kb[0] < MOST_GROWTH_KB
 
