@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from asm_gym.extras import needed_for
 from asm_gym.wrappers.recording import StreamRecorder
 from asm_gym.wrappers.safety import NeuralASMSafety
-from asm_gym.wrappers.vector import VectorNeuralASMSafety
+from asm_gym.wrappers.vector_safety import VectorNeuralASMSafety
 
 if TYPE_CHECKING:
     from asm_gym.wrappers.faults import FaultInjection

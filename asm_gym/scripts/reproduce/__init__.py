@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from asm_gym.extras import needed_for
 from asm_gym.scripts.cli import usage
 from asm_gym.scripts.command import DONE, exit_code
 from asm_gym.validation import check_choice
@@ -35,7 +36,8 @@ def main(argv: list[str] | None = None) -> int:
         from asm_gym.scripts.reproduce import kit
 
         check_choice("study", name, STUDIES)
-        module = import_module(f"asm_gym.scripts.reproduce.{MODULES.get(name, name)}")
+        with needed_for(f"asm-gym reproduce {name}"):
+            module = import_module(f"asm_gym.scripts.reproduce.{MODULES.get(name, name)}")
         return kit.main(name, module, rest)
 
     return exit_code("reproduce", chosen)
