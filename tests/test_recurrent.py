@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.memory.energy import Inference, infer
+from asm_gym.memory.carried_readout import direct, sense
+from asm_gym.memory.energy import Inference, infer, outward
 from asm_gym.memory.recurrent import (
     Change,
     Eligibility,
@@ -13,12 +14,9 @@ from asm_gym.memory.recurrent import (
     RecurrentWeights,
     Wiring,
     advance,
-    direct,
     follow_eligibility,
     initial_recurrent_weights,
     local_change,
-    outward,
-    sense,
 )
 
 HIDDEN = 6

@@ -22,6 +22,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.memory.carried_readout import (
+    CarriedNetwork,
+    Readout,
+    direct,
+    fill_missing,
+    sense,
+)
 from asm_gym.memory.energy import (
     Array,
     Inference,
@@ -41,7 +48,6 @@ from asm_gym.memory.learning import (
     Turn,
     coincidence,
 )
-from asm_gym.memory.recurrent import Readout, RecurrentNetwork, direct, fill_missing, sense
 from asm_gym.memory.temporal import Trained, learned_network
 from asm_gym.scaling import ScaledRows
 
@@ -124,8 +130,10 @@ def carry(
     return activate(mu), advance(c, sensed, weights.gains)
 
 
-class Network(RecurrentNetwork):
+class Network(CarriedNetwork):
     """The temporal network by traces; arguments as in ``TemporalNetwork``."""
+
+    weights: Weights
 
     def advance(self, m: Array, rows: Array) -> Array:
         return advance(m, rows, self.weights.gains)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
+from asm_gym.memory.carried_readout import direct, sense
 from asm_gym.memory.energy import (
     STEEPEST,
     STRIDE,
@@ -37,7 +38,6 @@ from asm_gym.memory.energy import (
     outward,
 )
 from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
-from asm_gym.memory.recurrent import direct, sense
 from asm_gym.memory.traces import (
     DECAYS,
     HebbianChange,
