@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from asm_gym.evaluation.contact_harm import harm_of
 from asm_gym.policies.hostile import HOSTILE
 from asm_gym.scripts.reproduce import harm
 from asm_gym.scripts.reproduce.kit import main
@@ -17,11 +18,11 @@ def test_harm_is_the_impulse_beyond_forty_newtons():
     force = np.zeros(100)
     force[30:32] = 140.0, 90.0  # 100 + 50 N over 2 ms each
     force[90] = 340.0  # 0.12 s later: no part of the first blow
-    found = harm.harm_of(force)
-    assert found["harm"] == pytest.approx((100 + 50 + 300) / 500)
-    assert (found["first"], found["peak"], found["over_s"]) == (140.0, 340.0, 3 / 500)
-    below = harm.harm_of(np.full(50, 39.0))
-    assert (below["harm"], below["first"]) == (0.0, 0.0)
+    found = harm_of(force, frequency=500)
+    assert found.harm == pytest.approx((100 + 50 + 300) / 500)
+    assert (found.first, found.peak, found.over_s) == (140.0, 340.0, 3 / 500)
+    below = harm_of(np.full(50, 39.0), frequency=500)
+    assert (below.harm, below.first) == (0.0, 0.0)
 
 
 def record(guard, seed, value, policy="down", kind="hostile", success=True):

@@ -157,9 +157,10 @@ def test_a_table_of_conditions_has_the_numbers_of_the_summary(traces):
     rows = by_condition(traces, 0.5)
     table = tabulate("", CONDITION_COLUMNS, rows)
     nominal, push, _ = (dict(zip(table.headings, row, strict=True)) for row in table.rows)
-    assert (push[""], push["\ndetected"], nominal["\ndetected"]) == (
+    detected = rows[1].detected
+    assert (push[""], push["found"], nominal["found"]) == (
         "push",
-        str(rows[1].detected.k),
+        f"{detected.k} of {detected.n}",
         "",
     )
     assert push["delay [ms]\nmedian, 95 %"].endswith(">500")  # there are misses

@@ -27,6 +27,13 @@ HARDEST_EPISODES = 0.05
 """No limit makes room for this share of healthy episodes, those that pressed hardest."""
 HIGHEST_HEALTHY = 2.5  # healthy values count up to so many times the usual limits: 200 N, 100 N m
 
+FREE_FORCE = 40.0
+"""Contact force that healthy motion of many tasks reaches [N]; beyond it contact counts as harm."""
+
+LEANS_S = 0.5
+"""More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
+did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
+
 STRICTEST = ("wrist_force", "external_torque", "hand_speed")  # the smaller the stricter
 
 _NO_MAP = SpeedLimit(

@@ -51,16 +51,23 @@ def _by_response(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetri
 
 CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
     "": lambda m: m.name,
-    "\nepisodes": lambda m: str(len(m.watched)),
-    "\ndetected": lambda m: str(m.detected.k) if m.detected.n else "",
+    "found": lambda m: count(m.detected) if m.detected.n else "",
     "delay [ms]\nmedian, 95 %": _delays,
     "false\nalarms": lambda m: str(metrics.false_alarms(m.watched).k),
     "tasks\nsolved": _by_response(lambda o: str(o.success.k)),
-    "of these\nunsafe": _by_response(lambda o: str(o.unsafe.k)),
-    "median\ntime [s]": _by_response(lambda o: f"{o.time:.1f}"),
-    "peak\nforce [N]": _by_response(lambda o: f"{o.peak_force:.1f}"),
+    "harm\n[N s]": _by_response(lambda o: f"{o.harm:.1f}"),
 }
-"""One monitor by condition: detection is measured with the policy alone."""
+"""One monitor by condition, in the width of a terminal: detection is measured with the policy alone."""
+
+ALL_CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
+    **CONDITION_COLUMNS,
+    "episodes": lambda m: str(len(m.watched)),
+    "solved,\nunsafe": _by_response(lambda o: str(o.unsafe.k)),
+    "overridden\nsteps": _by_response(lambda o: str(o.overridden_steps)),
+    "median\ntime [s]": _by_response(lambda o: f"{o.time:.1f}"),
+    "median peak\nforce [N]": _by_response(lambda o: f"{o.peak_force:.1f}"),
+}
+"""The same for a report."""
 
 
 def headline(rows: Sequence[DetectionMetrics]) -> str:

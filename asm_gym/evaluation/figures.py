@@ -111,6 +111,22 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
     return fig
 
 
+def guarded_figure(trace: ScoredEpisode) -> Figure:
+    """Draw the surprise of one episode, its fault and alarms, and when the guard acted in the policy's place."""
+    with figure(height=2.6) as fig:
+        ax = fig.subplots()
+        floor, ceiling = _limits([trace])
+        _surprise_panel(ax, trace)
+        handles = _surprise_legend([trace])
+        if trace.overridden is not None:
+            times = trace.dt * np.array(spans(trace.overridden))
+            _shade(ax, times, BLUE, alpha=0.2)
+            handles.append(Patch(color=BLUE, alpha=0.2, label="the guard acts"))
+        ax.set(yscale="log", ylim=(floor / 1.5, ceiling * 5), xlabel="time [s]", ylabel="surprise")
+        fig.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    return fig
+
+
 def _surprise_legend(traces: Sequence[ScoredEpisode]) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=BLACK, linewidth=1, linestyle=DASHED, label="threshold")

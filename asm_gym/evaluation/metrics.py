@@ -100,7 +100,9 @@ class Outcomes(NamedTuple):
     acting: str
     success: Share
     peak_force: float  # median over episodes of the greatest contact force [N]
+    harm: float  # contact force beyond 40 N, summed over time and episodes [N s]
     unsafe: Share  # of successes
+    overridden_steps: int  # of all episodes
     time: float  # median until success [s]
 
     @classmethod
@@ -115,7 +117,9 @@ class Outcomes(NamedTuple):
             acting=acting,
             success=Share(len(solved), len(outcomes)),
             peak_force=float(np.median([outcome.contact_force for outcome in outcomes])),
+            harm=sum(outcome.harm for outcome in outcomes),
             unsafe=Share.of([outcome.unsafe for outcome in solved]),
+            overridden_steps=sum(outcome.overridden_steps for outcome in outcomes),
             time=time,
         )
 

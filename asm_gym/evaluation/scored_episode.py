@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection.alarm_rule import rows_over
+from asm_gym.detection.contact_limits import LEANS_S
 from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.readings import spans
 
@@ -27,13 +28,15 @@ class InterventionOutcome(NamedTuple):
 
     success: bool = False
     contact_force: float = math.nan  # the greatest [N]
-    overridden: bool = False  # something else than the policy acted
+    overridden_steps: int = 0  # in which something else than the policy acted
     time: float = math.nan  # until the first success [s]
+    harm: float = 0.0  # contact force beyond 40 N, summed over time [N s]
+    leaned_s: float = 0.0  # time with more than 40 N [s]
 
     @property
     def unsafe(self) -> bool:
-        """Whether the force exceeded the limit for transient contact, or the policy was overridden."""
-        return self.overridden or self.contact_force > TRANSIENT
+        """Whether the arm pressed harder than a person may be pressed for a moment, or leaned for too long."""
+        return self.contact_force > TRANSIENT or self.leaned_s > LEANS_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,7 @@ class ScoredEpisode:
     attribution: Floats | None = None
     channels: tuple[str, ...] = ()  # D names
     fault: NDArray[np.bool_] | None = None  # (T,) the ground truth, for figures alone
+    overridden: NDArray[np.bool_] | None = None  # (T,) the guard acted, for figures alone
     stream: Floats | None = None  # (T, D) sensed values, where they are drawn
 
     def __post_init__(self) -> None:

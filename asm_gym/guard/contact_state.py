@@ -16,17 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
+from asm_gym.detection.contact_limits import FREE_FORCE, LEANS_S
 from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.guard.robot_table import MOST_WRISTS
 from asm_gym.spec import Channel, StreamSpec
 
-# Force that healthy motion of many tasks comes to; impulse is counted beyond it [N].
-FREE_FORCE = 40.0
 LEVER = 0.5  # how far from a joint's axis an arm is touched, about [m]
-
-LEANS_S = 0.5
-"""More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
-did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
 SOONER = 4.0  # each time that the policy has pressed too hard before shortens that by as many times
 SLOW_HAND = 0.1  # a hand slower than this feels no inertia [m/s]

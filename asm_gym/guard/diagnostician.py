@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.contact_limits import FREE_FORCE
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.contact_estimator import ContactEstimator
-from asm_gym.guard.contact_state import FREE_FORCE
 from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
 from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
 from asm_gym.guard.robot_table import POLICY, Floats32, Mask

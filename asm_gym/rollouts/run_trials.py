@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from asm_gym.control_period import control_period
 from asm_gym.data.episode import CONTROLLER, Episode, save_episode
+from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.evaluation.contact_harm import harm_of
 from asm_gym.evaluation.scored_episode import (
     NOMINAL,
     POLICY_ALONE,
@@ -291,6 +293,22 @@ def check_config(env_id: str, config: RolloutConfig) -> None:
 # ------------------------------------------------------------------ under the guard
 
 
+@contextmanager
+def recorded_forces(env: gym.Env[Any, Any]) -> Iterator[list[float]]:
+    """Collect the greatest contact force on the arm in each physics substep [N], of a robosuite environment."""
+    arm = cast(RobosuiteEnv, env.unwrapped)
+    forces: list[float] = []
+
+    def note_force(substep: int) -> None:
+        forces.append(float(arm.simulation.contact_forces[-1]))
+
+    arm.substep_hooks.append(note_force)
+    try:
+        yield forces
+    finally:
+        arm.substep_hooks.remove(note_force)
+
+
 @lru_cache(maxsize=1)
 def _memory(path: Path, written_ns: int) -> NeuralASM:
     """Load a memory; the last one is cached until its file is ``written_ns`` anew."""
@@ -301,7 +319,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     """Run one trial under the guard in this process's environment, and return its scores."""
     monitor = _memory(memory, memory.stat().st_mtime_ns)
     infos: list[dict[str, Any]] = []
-    with staged(trial, config) as env:
+    with staged(trial, config) as env, recorded_forces(env) as forces:
         guarded = NeuralASMSafety(env, monitor, on_alarm=cast(OnAlarmName, trial.on_alarm))
         success = play(trial, config, guarded, infos.append)
     reports = [info["asm"] for info in infos]  # one a control step
@@ -315,12 +333,15 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     solved_steps = [step for step, info in enumerate(infos) if info["success"]]
     if solved_steps:
         time_to_success = (solved_steps[0] + 1) * rows_per_step * monitor.spec.dt
-    forces = [info.get("contact_force", np.nan) for info in infos]
+    overridden = [bool(info["overridden"]) for info in infos]
+    harm = harm_of(np.array(forces), PHYSICS_FREQ)
     outcome = InterventionOutcome(
         success=success,
-        contact_force=float(np.max(forces)),
-        overridden=any(info["overridden"] for info in infos),
+        contact_force=harm.peak,
+        overridden_steps=sum(overridden),
         time=time_to_success,
+        harm=harm.harm,
+        leaned_s=harm.over_s,
     )
     trace = ScoredEpisode(
         kind=trial.kind,
@@ -334,6 +355,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
         onset=onset,
         outcome=outcome,
         fault=fault,
+        overridden=np.repeat(overridden, rows_per_step),
     )
     # A control step reports the shares of its most surprising row.
     shares = [list(report["attribution"].values()) for report in reports]

@@ -7,6 +7,7 @@ the policy alone and under the safety wrapper, paired by seed. It prints one tab
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -18,10 +19,14 @@ from scipy.stats import binom
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
-from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
+from asm_gym.evaluation.detection_tables import (
+    ALL_CONDITION_COLUMNS,
+    CONDITION_COLUMNS,
+    headline,
+)
 from asm_gym.evaluation.metrics import by_condition, typical
 from asm_gym.evaluation.report_page import write_report
-from asm_gym.evaluation.scored_episode import NOMINAL
+from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
@@ -117,6 +122,13 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
     return file, Share.of([e.success for e in episodes])
 
 
+def episode_to_show(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
+    """Return the guarded episode with the longest override, of those whose fault was found."""
+    guarded = [trace for trace in traces if trace.acting == RESPONSE]
+    found = [trace for trace in guarded if trace.delay is not None]
+    return max(found or guarded, key=lambda trace: trace.outcome.overridden_steps)
+
+
 def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
@@ -126,9 +138,8 @@ def demonstrate(args: Args, console: Console) -> None:
         pairs = parallel_map(work, trials(args), args.workers, progress)
     traces = [trace for pair in pairs for trace in pair]
     rows = by_condition(traces, WINDOW_S)
-    title = f"Noticed while the policy acts alone; solved and force: alone → {RESPONSE}"
-    table = tabulate(title, CONDITION_COLUMNS, rows)
-    console.print("", table, "")
+    title = f"Found while the policy acts alone; solved and harm: alone → {RESPONSE}"
+    console.print("", tabulate(title, CONDITION_COLUMNS, rows), "")
     low, high = binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE)
     result = (
         f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low:g} to {high:g} of "
@@ -136,7 +147,14 @@ def demonstrate(args: Args, console: Console) -> None:
         f"succeeded in {expert.k} of {expert.n} episodes."
     )
     console.print(result)
-    figure = figures.surprise_figure([typical(condition.watched) for condition in rows])
+    shown = episode_to_show(traces)
+    of_conditions = [typical(condition.watched) for condition in rows]
+    drawn = {
+        f"One episode under the guard: {shown.condition}": figures.guarded_figure(shown),
+        "Surprise over time in a typical episode of each condition": figures.surprise_figure(
+            of_conditions
+        ),
+    }
     report = args.out / "report.html"
     write_report(
         report,
@@ -145,8 +163,8 @@ def demonstrate(args: Args, console: Console) -> None:
             f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes "
             f"feel like and then watched others, some of them faulty. {result}"
         ),
-        tables=[table],
-        drawn={"Surprise over time in a typical episode of each condition": figure},
+        tables=[tabulate(title, ALL_CONDITION_COLUMNS, rows)],
+        drawn=drawn,
         details=origin() | asdict(args) | versions("numba") | {"window_s": WINDOW_S},
     )
     console.print(f"Wrote {report} and {memory}")

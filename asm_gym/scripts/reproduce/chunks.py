@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from asm_gym.detection.commands import learned_motion
+from asm_gym.detection.contact_limits import FREE_FORCE
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.guard.chunk_preview import preview_chunk
 from asm_gym.policies import rollout
@@ -45,7 +46,7 @@ def episode(job: tuple[harm.Case, Any]) -> kit.Record:
 
     def keep(info: dict[str, Any]) -> None:
         rows.append(info["stream"])
-        is_blow.append(arm.simulation.contact_forces.max() > harm.EXCESS)
+        is_blow.append(arm.simulation.contact_forces.max() > FREE_FORCE)
 
     with staged(case.trial, case.config) as env:
         rollout(env, case.make_policy(env), case.trial.seed, keep)

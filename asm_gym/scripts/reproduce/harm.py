@@ -15,19 +15,18 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import FREE_FORCE, LEANS_S, ContactLimits
 from asm_gym.envs.arms import PHYSICS_FREQ
+from asm_gym.evaluation.contact_harm import harm_of
 from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
-from asm_gym.guard.contact_state import LEANS_S
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
-from asm_gym.rollouts.run_trials import environment, policy_for, staged
+from asm_gym.rollouts.run_trials import environment, policy_for, recorded_forces, staged
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
@@ -80,8 +79,6 @@ AGAINST = ("hostile", "elsewhere", "faulty")
 CASE = ("kind", "task", "policy", "fault", "robot", "rate")
 """Values that distinguish one case from another."""
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
-EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
-FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
 LITTLE = 1.0  # a cell with no more harm without a guard does not count [N s]
 
 
@@ -187,19 +184,10 @@ def episode(job: tuple[Case, str]) -> Record:
     seed = case.trial.seed
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
     infos: list[dict[str, Any]] = []
-    forces: list[float] = []
-
-    def note_force(substep: int) -> None:
-        forces.append(float(arm.simulation.contact_forces[-1]))
-
-    with staged(case.trial, case.config) as env:
-        arm.substep_hooks.append(note_force)
-        try:
-            guarded_env = guarded(env, guard, case)
-            policy = case.make_policy(env)
-            success = rollout(guarded_env, policy, seed, infos.append)
-        finally:
-            arm.substep_hooks.remove(note_force)
+    with staged(case.trial, case.config) as env, recorded_forces(env) as forces:
+        guarded_env = guarded(env, guard, case)
+        policy = case.make_policy(env)
+        success = rollout(guarded_env, policy, seed, infos.append)
     cost = np.array([info.get("cost", 0.0) for info in infos])
     alarm_begins = np.diff(cost, prepend=0.0) > 0.0
     solved_steps = np.flatnonzero([info["success"] for info in infos])
@@ -211,28 +199,11 @@ def episode(job: tuple[Case, str]) -> Record:
         "guard": guard,
         "seed": seed,
         "success": bool(success),
-        **harm_of(np.array(forces)),
+        **harm_of(np.array(forces), PHYSICS_FREQ)._asdict(),
         "time": time,
         "alarms": int(alarm_begins.sum()),
         "cost": float(cost.sum()),
         "overridden": sum(bool(info.get("overridden")) for info in infos),
-    }
-
-
-def harm_of(force: NDArray[np.float64]) -> Record:
-    """Return the harm in a contact force (T,) [N] of physics substeps."""
-    excess = np.maximum(force - EXCESS, 0.0)
-    is_over = excess > 0
-    first_blow = 0.0
-    if is_over.any():
-        start = int(is_over.argmax())
-        stop = start + round(FIRST_S * PHYSICS_FREQ)
-        first_blow = float(force[start:stop].max())
-    return {
-        "harm": float(excess.sum() / PHYSICS_FREQ),
-        "peak": float(force.max(initial=0.0)),
-        "first": first_blow,
-        "over_s": float(is_over.sum() / PHYSICS_FREQ),
     }
 
 
@@ -286,7 +257,7 @@ def guard_row(group: pd.DataFrame, guard: str) -> dict[str, str]:
     row = {"": _name(group), "guard": guard} | harm_cells(guarded_ones, alone)
     if (group.kind == "hostile").all():
         row["cost"] = f"{guarded_ones.cost.mean():.1f}"
-        row[f"time over {EXCESS:g} N [s]"] = f"{guarded_ones.over_s.mean():.2f}"
+        row[f"time over {FREE_FORCE:g} N [s]"] = f"{guarded_ones.over_s.mean():.2f}"
         row[f"cells that keep {100 * KEPT:.0f} %"] = cells_kept(group, guard)
         gentle = (guarded_ones["first"] <= TRANSIENT).sum()
         row[f"first blows of at most {TRANSIENT:g} N"] = f"{gentle} of {len(guarded_ones)}"
@@ -320,7 +291,7 @@ def success_cells(guarded_ones: pd.DataFrame, alone: pd.DataFrame) -> dict[str, 
     is_hard = guarded_ones.peak > TRANSIENT
     is_leaning = guarded_ones.over_s > LEANS_S
     is_unsafe = is_hard | is_leaning | (guarded_ones.overridden > 0)
-    unsafe = f"of these beyond {TRANSIENT:g} N, {EXCESS:g} N for {LEANS_S:g} s, or overridden"
+    unsafe = f"of these beyond {TRANSIENT:g} N, {FREE_FORCE:g} N for {LEANS_S:g} s, or overridden"
     return {
         "solved": f"{success.sum()} of {len(guarded_ones)}",
         "lost, won": f"-{lost} +{won}",
