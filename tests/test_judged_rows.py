@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from asm_gym.detection.alarm_rule import EVENTS, JUDGED
+from asm_gym.detection.contact_limits import FREE_FORCE, LEANS_S
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.alarm_terms import ALARM_TERMS, register_alarm_term
 from asm_gym.guard.arbiter import MOSTLY_AFTER
 from asm_gym.guard.contact_state import (
-    FREE_FORCE,
     HEAVIEST,
-    LEANS_S,
     LEVER,
     SLOW_FORCE,
     SLOW_HAND,
