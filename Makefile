@@ -24,7 +24,7 @@ demo: $(stamp) ## run the demonstration; ARGS=--help lists its options
 	@$(bin)/asm-gym demo $(ARGS)
 
 reproduce: $(stamp) ## run the studies of the method's claims; ARGS=--quick to see that they run
-	@for study in memorise_and_recall repertoire panda local_learning harm chunks; do $(bin)/asm-gym reproduce $$study $(ARGS) || exit; done
+	@for study in memorise_and_recall repertoire panda harm chunks; do $(bin)/asm-gym reproduce $$study $(ARGS) || exit; done
 
 doctor: $(stamp) ## say what this machine lacks, and the command that installs it
 	@$(bin)/asm-gym doctor

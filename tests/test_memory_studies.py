@@ -7,11 +7,11 @@ import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.recurrent import Eligibility, RecurrentLearner, initial_recurrent_weights
 from asm_gym.memory.settling import learn_settling
-from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import closed_loop, memorise_and_recall, skill_measures, workspace
-from asm_gym.scripts.reproduce.backpropagation import Batch, Training, expected, side_by_side
+from asm_gym.scripts.reproduce.backpropagation import Training, expected, side_by_side
 from asm_gym.scripts.reproduce.backpropagation import train as train_recurrent
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
@@ -29,7 +29,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     repertoire,
     written,
 )
-from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
+from asm_gym.scripts.reproduce.repertoire import OneStepLearner
 
 
 def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
@@ -69,15 +69,6 @@ def test_the_memory_recalls_each_letter_from_its_cue():
     assert error < 0.5 * still
 
 
-def small_batch(steps: int) -> tuple[Weights, Batch]:
-    rng = np.random.default_rng(0)
-    senses, commands = (rng.normal(size=(steps, 4, n)).astype(np.float32) for n in (5, 3))
-    weights = initial_weights(7, 5, 2, rng)
-    weights.W_F[:] = rng.normal(size=weights.W_F.shape)
-    weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(5, 2)
-    return weights, Batch(senses, commands)
-
-
 def test_the_network_as_published_memorises_what_it_reads_side_by_side(monkeypatch):
     monkeypatch.setattr(memorise_and_recall, "PUBLISHED_UNITS", 32)
     monkeypatch.setattr(memorise_and_recall, "PUBLISHED_RATE", 3e-3)
@@ -93,47 +84,24 @@ def test_the_network_as_published_memorises_what_it_reads_side_by_side(monkeypat
     assert errors[120] < 0.5 * errors[1]
 
 
-def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finite_differences():
-    weights, batch = small_batch(14)
-    read, alone = (local(weights, batch, 8, alone, pi_z=1.0) for alone in (False, True))
-    gradient = {
-        target: exact(weights, batch, 8, target, pi_z=1.0)
-        for target in ("energy", "error", "alone")
-    }
-    assert gradient["energy"].energy == pytest.approx(read.energy, rel=1e-4)
-    assert gradient["error"].error == pytest.approx(read.error, rel=1e-4)
-    assert gradient["alone"].error == pytest.approx(alone.error, rel=1e-4)
-    for name, index in (("W_C", (2, 3)), ("W_F", (1, 4)), ("W_D", (0, 2)), ("W_D", (6, 5))):
-        for target in ("error", "alone"):
-            ends = []
-            for step in (0.01, -0.01):
-                moved = getattr(weights, name).copy()
-                moved[index] += step
-                ends.append(
-                    local(weights._replace(**{name: moved}), batch, 8, target == "alone", 1.0).error
-                )
-            slope = (ends[0] - ends[1]) / 0.02
-            assert -gradient[target].arrays[name][index] == pytest.approx(slope, rel=0.05, abs=0.02)
-
-
-def test_the_local_change_is_the_gradient_of_the_energy_and_of_the_error_for_a_firm_prior():
-    weights, batch = small_batch(6)
-    ours, theirs = local(weights, batch, 400, pi_z=1.0), exact(weights, batch, 400, "energy", 1.0)
-    for name in COMPARED:
-        np.testing.assert_allclose(ours.arrays[name], theirs.arrays[name], atol=1e-3)
-    weights, batch = small_batch(20)
-    angles = []
-    for pi_z in (1.0, 100.0):
-        angles.append(
-            cosine(local(weights, batch, 50, pi_z=pi_z), exact(weights, batch, 50, "error", pi_z))
-        )
-        alone = (
-            local(weights, batch, 50, alone=True, pi_z=pi_z),
-            exact(weights, batch, 50, "alone", pi_z),
-        )
-        assert 0.2 < cosine(*alone) < 0.999  # the way back through time is left out
-    assert 0.5 < angles[0] < angles[1]
-    assert angles[1] > 0.999
+def test_recurrent_units_cut_to_one_step_are_eligible_for_the_last_row_alone():
+    rng = np.random.default_rng(0)
+    schedule = Schedule(1, 4, 1e-3, 5, 1.0, 1.0, 0.0)
+    weights = initial_recurrent_weights(8, 3, 2, rng)
+    first, last = rng.normal(size=(2, 4, 6)).astype(np.float32)
+    cut, whole, late = (
+        kind(weights, schedule, rng)
+        for kind in (OneStepLearner, RecurrentLearner, RecurrentLearner)
+    )
+    state = cut.at_rest(4)
+    for learner in (cut, whole):
+        learner.mark_eligible(state, first)
+        learner.mark_eligible(state + 1, last)
+    late.mark_eligible(state + 1, last)
+    for name in Eligibility._fields:
+        of_last = getattr(late.eligible, name)
+        np.testing.assert_allclose(getattr(cut.eligible, name), of_last, atol=1e-6)
+    assert np.abs(whole.eligible.B_re - late.eligible.B_re).max() > 0.01
 
 
 def test_the_rival_learns_from_episodes_of_different_lengths():

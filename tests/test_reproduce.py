@@ -34,7 +34,7 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("memorise_and_recall --cues 60", "cue must be .*59.*got 60"),
         ("memorise_and_recall --repertoires 0", "letters must be .*32.*got 0"),
         ("memorise_and_recall --seeds 0", "seeds must be at least 1, got 0"),
-        ("local_learning --hidden 1", "hidden must be at least 4, got 1"),
+        ("repertoire --letters 1", "letters must be at least 2, got 1"),
         ("everything", "unknown study 'everything'; known: memorise_and_recall"),
     ],
 )

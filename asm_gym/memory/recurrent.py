@@ -399,8 +399,12 @@ class RecurrentLearner(Learner):
         if self.schedule.noise > 0:
             noise = self.rng.standard_normal(rows[:, :-1].shape, np.float32)
             rows[:, :-1] += np.float32(self.schedule.noise) * noise
-        follow_eligibility(self.eligible, state, rows, w)
+        self.mark_eligible(state, rows)
         return advance(state, rows, w), energy
+
+    def mark_eligible(self, state: Array, rows: Array) -> None:
+        """Advance the eligibility by the rows r_t (B, R), from m_{t-1} (B, I)."""
+        follow_eligibility(self.eligible, state, rows, self.weights)
 
 
 def near_gradient(schedule: Schedule) -> Schedule:

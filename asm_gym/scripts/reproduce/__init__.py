@@ -14,7 +14,6 @@ STUDIES = {
     "memorise_and_recall": "one network learns skills and recalls each from a cue",
     "repertoire": "capacity, forgetting and labels on letters, beside movement primitives",
     "panda": "one network learns six skills of the Panda without labels",
-    "local_learning": "local learning compared with backpropagation through time",
     "harm": "harm that the guard avoids, and success that it keeps",
     "chunks": "impacts predicted from chunks of actions, and false predictions",
     "hours": "false alarms an hour of a shipped memory; needs a corpus",

@@ -1,6 +1,7 @@
 """Repertoire: what a reviewer would ask of a network that memorises letters.
 
     capacity          error of recall by letters and units
+    one step          recurrent units whose eligibility is of the last row alone: what is learned is not the gradient
     one by one        letters learned one after another, and what is left of each in the end
     told              the row also says which letter it is of
     primitives        probabilistic and dynamic movement primitives, which are told the letter in training
@@ -20,7 +21,8 @@ from matplotlib.figure import Figure
 
 from asm_gym.data.episode import Episode
 from asm_gym.evaluation.figures import figure
-from asm_gym.memory.learning import Trajectory, practise
+from asm_gym.memory.energy import Array
+from asm_gym.memory.learning import practise
 from asm_gym.memory.recurrent import (
     RecurrentLearner,
     RecurrentNetwork,
@@ -28,10 +30,8 @@ from asm_gym.memory.recurrent import (
     near_gradient,
 )
 from asm_gym.memory.temporal import unassociated
-from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import backpropagation, kit
-from asm_gym.scripts.reproduce.backpropagation import Training
 from asm_gym.scripts.reproduce.expression import (
     PEN,
     Backpropagated,
@@ -67,14 +67,14 @@ class Config(kit.Config):
 
     repertoires: tuple[int, ...] = option((8, 16, 32), quick=(4,), least=1, check=check_letters)
     """Letters that one network learns."""
-    units: tuple[int, ...] = option((60, 120, 240), quick=(32,), least=1)
-    """Hidden units of the network of recurrent units; the middle one has as many weights as the GRU."""
+    units: tuple[int, ...] = option((120, 60, 30, 15), quick=(32,), least=1)
+    """Hidden units; with the first, which has as many weights as a GRU of 64, all but capacity is measured."""
     letters: int = option(8, quick=3, least=2, check=check_letters)
     """Letters that are learned one after another, or with their names."""
     steps: int = option(16000, quick=600, least=1)
     """Batches of 64 rows."""
     updates: int = option(1200, quick=40, least=1)
-    """Batches of 16 letters for the GRU."""
+    """Batches of 16 letters for the GRU, which learns one letter after another."""
     writings: int = option(8, quick=4, least=2)
     """Writings of each letter to learn from."""
 
@@ -88,7 +88,7 @@ def run(config: Config) -> Findings:
     for question, own in frame.groupby("question", sort=False):
         caption = f"{question}: error [cm] after a cue of {CUE} rows; mean ± SD over seeds"
         tables.append(kit.grid(caption, own, "error_cm", "model", "at"))
-    return Findings(records, tables, capacity_figure(frame[frame.question == "capacity"]))
+    return Findings(records, tables, errors_figure(frame))
 
 
 def one_seed(seed: int, config: Config) -> list[Record]:
@@ -108,24 +108,26 @@ def one_seed(seed: int, config: Config) -> list[Record]:
         for units in config.units:
             memory = learned(train, units, config, rng)
             note("capacity", f"recurrent, {units} units", count, error_of(memory, tests))
-        gru = Backpropagated.learned(train, training(config), rng)
-        note("capacity", "GRU, 64 units", count, error_of(gru, tests))
+        units = config.units[0]
+        cut = learned_in_turn([train], units, config, rng, OneStepLearner)
+        note("capacity", f"recurrent, {units} units, one step", count, error_of(cut, tests))
         for name, error in errors_of_primitives(train, tests).items():
             note("capacity", name, count, error)
 
     few = letters[: config.letters]
     train = copybook(few, config.writings, rng)
     tests = copybook(few, 4, rng)
-    units = config.units[len(config.units) // 2]
-    one_by_one: dict[str, Expresser] = {
-        "recurrent": learned_one_by_one(train, units, config, rng),
+    units = config.units[0]
+    together = learned(train, units, config, rng)
+    models: dict[str, Expresser] = {
+        "recurrent, all at once": together,
+        "recurrent": learned_in_turn(by_letter(train), units, config, rng),
         "GRU": gru_one_by_one(train, config, rng),
     }
-    for name, model in one_by_one.items():
+    for name, model in models.items():
         for place, letter in enumerate(few, start=1):
             own = [test for test in tests if test.info["skill"] == letter.name]
-            note("one by one, by place in the order", name, place, error_of(model, own))
-    together = learned(train, units, config, rng)
+            note("one by one", name, place, error_of(model, own))
     note("labels", "recurrent, unlabelled", config.letters, error_of(together, tests))
     told = learned(with_names(train, few), units, config, rng)
     note("labels", "recurrent, told", config.letters, error_of(told, with_names(tests, few)))
@@ -136,11 +138,6 @@ def error_of(model: Expresser, tests: Sequence[Episode]) -> float:
     """Return the mean distance of the recalled pen [cm]."""
     error, _ = recalled(model, tests, mean_demonstrations(tests), CUE)
     return error
-
-
-def training(config: Config) -> Training:
-    """Return the settings of the GRU."""
-    return replace(BACKPROPAGATION, updates=config.updates)
 
 
 # ------------------------------------------------------------------ learning
@@ -154,30 +151,40 @@ def learned(
     return ExpressionMemory.learned(train, settings, rng)
 
 
-def by_letter(reader: StreamScaler, train: Sequence[Episode]) -> list[list[Trajectory]]:
+def by_letter(train: Sequence[Episode]) -> list[list[Episode]]:
     """Return the writings of each letter, in the order in which letters come."""
-    names = list(dict.fromkeys(episode.info["skill"] for episode in train))
-    parts = []
-    for name in names:
-        own = [episode for episode in train if episode.info["skill"] == name]
-        parts.append(trajectories(reader, own))
-    return parts
+    parts: dict[str, list[Episode]] = {}
+    for episode in train:
+        parts.setdefault(episode.info["skill"], []).append(episode)
+    return list(parts.values())
 
 
-def learned_one_by_one(
-    train: Sequence[Episode], units: int, config: Config, rng: np.random.Generator
+class OneStepLearner(RecurrentLearner):
+    """Recurrent units whose eligibility is of the last row alone."""
+
+    def mark_eligible(self, state: Array, rows: Array) -> None:
+        for array in self.eligible:
+            array[:] = 0.0
+        super().mark_eligible(state, rows)
+
+
+def learned_in_turn(
+    parts: Sequence[Sequence[Episode]],
+    units: int,
+    config: Config,
+    rng: np.random.Generator,
+    learner_type: type[RecurrentLearner] = RecurrentLearner,
 ) -> ExpressionMemory:
-    """Return a network of recurrent units that has learned one letter after another, with as many batches in all."""
-    reader = fit_reader(train)
-    parts = by_letter(reader, train)
+    """Return a network of recurrent units that has learned one part after another, with as many batches in all."""
+    reader = fit_reader([episode for part in parts for episode in part])
     settings = replace(AGAINST_NOISE, steps=config.steps // len(parts))
-    rows = sum(len(trajectory.senses) for trajectory in parts[0])
-    schedule = schedule_of(settings, rows)
-    sensory = parts[0][0].senses.shape[1]
-    motor = parts[0][0].commands.shape[1] - 1
+    schedule = schedule_of(settings, sum(map(len, parts[0])))
+    taught = [trajectories(reader, part) for part in parts]
+    sensory = taught[0][0].senses.shape[1]
+    motor = taught[0][0].commands.shape[1] - 1
     weights = initial_recurrent_weights(units, sensory, motor, rng)
-    learner = RecurrentLearner(weights, near_gradient(schedule), rng)
-    for own in parts:
+    learner = learner_type(weights, near_gradient(schedule), rng)
+    for own in taught:
         practise(learner, own, rng, lambda: None)
     network = RecurrentNetwork(weights, unassociated(), schedule.iterations, 1.0, 1.0)
     return ExpressionMemory(reader, network)
@@ -188,11 +195,11 @@ def gru_one_by_one(
 ) -> Backpropagated:
     """Return a GRU that has learned one letter after another, with as many batches in all."""
     reader = fit_reader(train)
-    parts = by_letter(reader, train)
-    settings = replace(training(config), updates=max(1, config.updates // len(parts)))
+    parts = by_letter(train)
+    settings = replace(BACKPROPAGATION, updates=max(1, config.updates // len(parts)))
     network = None
     for own in parts:
-        network = backpropagation.train(own, settings, rng, network)
+        network = backpropagation.train(trajectories(reader, own), settings, rng, network)
     return Backpropagated(reader, network)
 
 
@@ -231,11 +238,15 @@ def errors_of_primitives(train: Sequence[Episode], tests: Sequence[Episode]) -> 
     return errors
 
 
-def capacity_figure(records: pd.DataFrame) -> Figure:
-    """Draw the error over the number of letters."""
-    with figure(height=3.4, width=5) as fig:
-        ax = fig.subplots()
-        curves(ax, records, "error_cm", "at", "model")
-        ax.set(xlabel="letters in the repertoire", ylabel="error of recall [cm]", xscale="log")
-        ax.legend(fontsize=7)
+def errors_figure(records: pd.DataFrame) -> Figure:
+    """Draw the error over the number of letters, and of each letter once all are learned one by one."""
+    with figure(height=3.4, width=8) as fig:
+        left, right = fig.subplots(1, 2)
+        for ax, question, label in (
+            (left, "capacity", "letters in the repertoire"),
+            (right, "one by one", "place in the order of learning"),
+        ):
+            curves(ax, records[records.question == question], "error_cm", "at", "model")
+            ax.set(xlabel=label, ylabel="error of recall [cm]", yscale="log")
+            ax.legend(fontsize=7)
     return fig
