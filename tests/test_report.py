@@ -142,6 +142,21 @@ def test_a_report_holds_everything_and_fetches_nothing(traces, tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html"]  # nothing unfinished
 
 
+def test_the_opening_figure_shows_when_the_guard_acts_and_stands_before_the_tables(
+    traces, tmp_path: Path
+):
+    trace = next(t for t in traces if t.delay is not None)
+    overridden = np.zeros(len(trace), np.bool_)
+    overridden[25:40] = True
+    figure = figures.guarded_figure(dataclasses.replace(trace, overridden=overridden))
+    legend = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert legend == {"threshold", "fault active", "in alarm", "the guard acts"}
+    table = Table("A table", ("", "b"), [("a", "b")])
+    out = write_report(tmp_path / "r.html", "t", "i", [table], {}, opening={"Opening": figure})
+    source = out.read_text(encoding="utf-8")
+    assert source.index("Opening") < source.index("A table")
+
+
 def test_whatever_is_written_is_escaped(tmp_path: Path):
     evil = '<script>alert("x")</script> $title & co'
     table = Table(evil, (evil, "b"), [(evil, evil)])

@@ -41,6 +41,7 @@ def write_report(
     tables: Sequence[Table],
     drawn: Mapping[str, Figure],
     details: Mapping[str, object] | None = None,
+    opening: Mapping[str, Figure] | None = None,
 ) -> Path:
     """Write an HTML file, which appears when it is complete.
 
@@ -48,9 +49,12 @@ def write_report(
         intro: plain text; an empty line starts a new paragraph.
         drawn: figures by caption.
         details: how to make the report again: arguments, seed, versions.
+        opening: figures by caption that stand before the tables.
     """
     path = Path(path)
     parts = [f"<p>{escape(p)}</p>" for p in intro.split("\n\n") if p.strip()]
+    if opening:
+        parts += [_figure(caption, figure) for caption, figure in opening.items()]
     if tables:
         parts.append("<section><h2>Results</h2>\n" + "\n".join(map(_table, tables)) + "</section>")
     if drawn:

@@ -123,10 +123,10 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
 
 
 def episode_to_show(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
-    """Return the guarded episode with the longest override, of those whose fault was found."""
+    """Return the guarded episode with the longest override, of those with a fault that were solved."""
     guarded = [trace for trace in traces if trace.acting == RESPONSE]
-    found = [trace for trace in guarded if trace.delay is not None]
-    return max(found or guarded, key=lambda trace: trace.outcome.overridden_steps)
+    solved = [trace for trace in guarded if trace.outcome.success and trace.onset is not None]
+    return max(solved or guarded, key=lambda trace: trace.outcome.overridden_steps)
 
 
 def demonstrate(args: Args, console: Console) -> None:
@@ -148,13 +148,9 @@ def demonstrate(args: Args, console: Console) -> None:
     )
     console.print(result)
     shown = episode_to_show(traces)
+    one_episode = {"One episode under the guard": figures.guarded_figure(shown)}
     of_conditions = [typical(condition.watched) for condition in rows]
-    drawn = {
-        f"One episode under the guard: {shown.condition}": figures.guarded_figure(shown),
-        "Surprise over time in a typical episode of each condition": figures.surprise_figure(
-            of_conditions
-        ),
-    }
+    surprise = figures.surprise_figure(of_conditions)
     report = args.out / "report.html"
     write_report(
         report,
@@ -164,7 +160,8 @@ def demonstrate(args: Args, console: Console) -> None:
             f"feel like and then watched others, some of them faulty. {result}"
         ),
         tables=[tabulate(title, ALL_CONDITION_COLUMNS, rows)],
-        drawn=drawn,
+        opening=one_episode,
+        drawn={"Surprise over time in a typical episode of each condition": surprise},
         details=origin() | asdict(args) | versions("numba") | {"window_s": WINDOW_S},
     )
     console.print(f"Wrote {report} and {memory}")
