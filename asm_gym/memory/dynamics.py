@@ -101,7 +101,7 @@ def train(
     schedule: Schedule,
     rng: np.random.Generator,
     progress: Callable[[int, int], object] | None = None,
-    dynamics: str = TRACES,
+    dynamics: str = RECURRENT,
 ) -> Trained:
     """Learn the synapses through time, then those of association, from whole episodes.
 

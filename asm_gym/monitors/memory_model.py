@@ -16,7 +16,7 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.association import Association, ChangeLayout, association_shapes
 from asm_gym.memory.completion import Completion
-from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
+from asm_gym.memory.dynamics import DYNAMICS, RECURRENT, dynamics_of, train
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear_association import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
@@ -52,7 +52,7 @@ class MemoryModel(ScaledModel):
         hidden_size: int,
         association_size: int,
         schedule: Schedule,
-        dynamics: str = TRACES,
+        dynamics: str = RECURRENT,
     ) -> None:
         super().__init__(spec, rows_apart(spec.dt))
         self.dynamics = dynamics

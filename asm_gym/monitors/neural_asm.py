@@ -19,7 +19,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
-from asm_gym.memory.dynamics import DYNAMICS, TRACES
+from asm_gym.memory.dynamics import DYNAMICS, RECURRENT
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
@@ -58,8 +58,9 @@ class NeuralASM(CalibratedMonitor):
             at 0.6).
         habituates: divide surprise by its usual size in a context. The context depends on the policy, so use False for
             a memory that watches any policy.
-        dynamics: how the temporal network represents the past: ``"traces"`` of senses and actions, or ``"settling"``,
-            the temporal predictive coding network of the papers, whose state is inferred on every row.
+        dynamics: how the temporal network represents the past: ``"recurrent"``, by units that learn how long they
+            remember, or ``"settling"``, the temporal predictive coding network of the papers, whose state is inferred
+            on every row. ``"traces"``, with fixed decays, is that of memories from earlier versions.
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
         values: judge values, such as torques, beside changes (``monitors.torque``), if other senses predict them: for
@@ -99,7 +100,7 @@ class NeuralASM(CalibratedMonitor):
         epochs: int = EPOCHS,
         free_running_probability: float = 0.0,
         habituates: bool = True,
-        dynamics: str = TRACES,
+        dynamics: str = RECURRENT,
         excuses: bool = False,
         values: bool | None = None,
         urdf: str = "",
