@@ -304,10 +304,10 @@ def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     saved = read_checkpoint(tmp_path / "settling.asm", NeuralASM.kind)
     with pytest.raises(
         ValueError,
-        match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'traces'$",
+        match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'recurrent'$",
     ):
         NeuralASM(sine_spec(), 32, 48).restore(saved)
-    traces = NeuralASM(sine_spec(), 8, 8, epochs=1).fit(sine_episodes(5))
+    traces = NeuralASM(sine_spec(), 8, 8, epochs=1, dynamics="traces").fit(sine_episodes(5))
     traces.save(tmp_path / "traces.asm")
     with pytest.raises(
         ValueError,
