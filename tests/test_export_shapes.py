@@ -16,6 +16,7 @@ import pytest
 
 from asm_gym.data.logs import Log, read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints
 from tests.needs import needs
 
@@ -479,6 +480,31 @@ def logs_of(shape: Shape, at: Path) -> tuple[list[Log], Motion]:
     m = motion(shape.hz)
     with noted():
         return list(read_logs(shape.write(at, m), SchemaHints(**shape.layout))), m
+
+
+def test_names_of_lerobot_that_do_not_fit_are_numbered_with_a_note(tmp_path):
+    m = motion(30)
+    for at in ("few", "twice"):
+        (tmp_path / at).mkdir()
+    with noted() as notes:
+        ((_, few),) = read_logs(lerobot(tmp_path / "few", m, NAMES[:1]))
+        ((_, twice),) = read_logs(lerobot(tmp_path / "twice", m, [NAMES[0]] * 2))
+    state = "observation.state"
+    assert few.spec.labels[:2] == (f"{state}[0]", f"{state}[1]")
+    assert twice.spec.labels[:2] == (f"{state}[{NAMES[0]}]", f"{state}[{NAMES[0]}_2]")
+    np.testing.assert_array_equal(few.stream, twice.stream)
+    assert sum(state in note for note in notes) == 2
+
+
+def test_a_memory_with_names_takes_no_column_by_position(tmp_path):
+    m = motion(30)
+    for at in ("named", "bare"):
+        (tmp_path / at).mkdir()
+    ((_, named),) = read_logs(lerobot(tmp_path / "named", m))
+    bare = lerobot(tmp_path / "bare", m, None)
+    schema = LogSchema.kept_in(named.info, named.spec)
+    with noted(), pytest.raises(ValueError, match=NAMES[1]):
+        list(read_logs(bare, schema=schema))
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -18,7 +18,9 @@ from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_file import read_schema, write_schema
-from asm_gym.monitors import load_monitor
+from asm_gym.guard.live_events import LiveEvent
+from asm_gym.guard.live_watch import follow
+from asm_gym.monitors import load_monitor, make_monitor
 from asm_gym.scripts.cli import main
 from tests.streams import arm_table
 from tests.test_export_shapes import SHAPES, motion
@@ -152,8 +154,6 @@ def test_a_live_row_is_read_by_the_schema_that_the_memory_keeps():
 
 
 def test_python_memories_keep_the_schema_too(tmp_path):
-    from asm_gym.monitors import make_monitor
-
     episodes = Episode.from_tables([arm_table(n) for n in range(30)])
     monitor = make_monitor("kalman", episodes[0].spec).fit(episodes[:15])
     monitor.calibrate(episodes[15:], 0.1).save(tmp_path / "m.asm")
@@ -224,8 +224,6 @@ def test_logs_of_another_scale_are_named_until_the_schema_says_otherwise(tmp_pat
 
 
 def test_python_refuses_logs_of_another_scale_too():
-    from asm_gym.monitors import make_monitor
-
     logs = [in_degrees(arm_table(n), False) if n % 4 == 3 else arm_table(n) for n in range(12)]
     episodes = Episode.from_tables(logs)
     with pytest.raises(ValueError, match=r"degrees.*episode 3"):
@@ -262,25 +260,48 @@ def test_a_log_that_is_there_twice_is_refused(tmp_path, capsys):
 # ------------------------------------------------------------------ the robot's time
 
 
-def test_alarms_of_a_recording_carry_the_stamp_of_the_row_and_the_date(tmp_path, capsys):
+def test_alarms_of_a_recording_carry_the_stamp_of_the_row_and_its_name_in_the_log(tmp_path, capsys):
     folder = write_folder(tmp_path / "logs", [arm_table(n) for n in range(40)])
     memory = tmp_path / "m.asm"
     assert main(["fit", str(folder), "--out", str(memory), *FAST]) == 0
     faulty = arm_table(50)
     faulty["q_1"][40:] = faulty["q_1"][40]
-    faulty["time"] = 1_700_000_000.0 + faulty["time"]
-    bad = write_folder(tmp_path / "bad", [faulty])
+    dated = dict(faulty, time=1_700_000_000.0 + faulty["time"])
+    late = dict(faulty, time=960.0 + faulty["time"])
+    bad = write_folder(tmp_path / "bad", [dated, late])
     capsys.readouterr()
     watch = ["watch", str(bad), "--monitor", str(memory), "--out", str(tmp_path / "w")]
     assert main([*watch, "--json"]) == 1
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    alarm = next(event for event in events if event["kind"] == "alarm")
+    alarm, of_late = (
+        next(event for event in events if event["kind"] == "alarm" and event["log"] == name)
+        for name in ("00.csv", "01.csv")
+    )
     assert events[-1]["kind"] == "summary"
-    assert alarm["log"] == "00.csv"
-    assert alarm["stamp"] == pytest.approx(1_700_000_000 + alarm["time"] - 0.02, abs=1e-3)
     assert alarm["date"].startswith("2023-11-14T22:13:2")
     table = pd.read_csv(tmp_path / "w" / "alarms.csv")
-    assert table["clock [s]"][0] == pytest.approx(alarm["stamp"], abs=1e-3)
+    begins = table.groupby("log")["from [s]"].first()
+    first_stuck = faulty["time"][40]
+    for event, origin in ((alarm, 1_700_000_000.0), (of_late, 960.0)):
+        assert event["stamp"] == event["time"]
+        assert 0 <= event["stamp"] - origin - first_stuck < 0.4
+        assert begins[event["log"]] == pytest.approx(event["stamp"], abs=1e-3)
+        assert event["channel"].startswith("q_")
+
+
+def test_live_alarms_carry_the_stamp_and_the_name_of_the_log(tmp_path):
+    episodes = Episode.from_tables([arm_table(n) for n in range(30)])
+    monitor = make_monitor("kalman", episodes[0].spec).fit(episodes[:15])
+    monitor.calibrate(episodes[15:], 0.1)
+    faulty = arm_table(50)
+    faulty["q_1"][40:] += 3.0
+    faulty["time"] = 960.0 + faulty["time"]
+    lines = [json.dumps({name: float(v[k]) for name, v in faulty.items()}) for k in range(60)]
+    events: list[LiveEvent] = []
+    assert follow(lines, monitor, events.append) > 0
+    assert events[0].channel in faulty
+    assert events[0].stamp == pytest.approx(960.0 + 40 * 0.02)
+    assert str(events[0]).startswith("960.8")
 
 
 def test_the_period_of_a_schema_is_that_of_its_rate():

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 class ColumnMatch:
     """Find the numbers of a stream's row among the columns of a table or the names of a line.
 
-    A column is found by its name, by the stream's label, or by its place in a list of its channel.
+    A column is found by its name, or by the stream's label. Where the numbers of a channel have no
+    names, they are also found by place in a list.
 
     Args:
         schema: how logs are read.
@@ -111,10 +112,14 @@ def _headers_by_name(names: Iterable[str]) -> dict[str, str]:
 def _with_places(
     columns: Sequence[LogColumn], by_name: Mapping[str, str]
 ) -> Iterator[tuple[LogColumn, str]]:
-    """Yield each column, and its place in a list of its channel, ``q[1]``, if no name is there."""
-    named = set()  # channels of which a column is there by name
+    """Yield each column, and its place in a list of its channel, ``q[1]``, where its numbers have no names.
+
+    Which of several names comes first in a list, nothing tells.
+    """
+    named = set()  # channels whose numbers have names, or of which a column is there by name
     for column in columns:
-        if column.name in by_name or column.label in by_name:
+        has_name = bool(column.element) and not column.element.isdecimal()
+        if has_name or column.name in by_name or column.label in by_name:
             named.add(column.channel)
     count = Counter[str]()
     for column in columns:

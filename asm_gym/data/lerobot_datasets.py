@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.array_files import read_parquet
+from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import Columns, as_array
 
 INFO_FILE = Path("meta") / "info.json"
@@ -94,10 +95,34 @@ def _element_names(names: Any) -> list[str]:
 
 
 def _columns(name: str, values: Any, elements: list[str]) -> Columns:
-    """The columns of a feature (T,) or (T, k), each by its name where there are as many different names."""
-    columns = {}
-    for element, column in zip(elements, values.T, strict=False):
-        columns[f"{name}[{element}]"] = column
-    if values.shape[1:] == (len(columns),) == (len(elements),):
-        return columns
-    return {name: values}
+    """Return the columns of a feature (T,) or (T, k), each by its name; without names, the feature as it is.
+
+    Names that are too few or too many are not read, as nothing tells which number has none; one that comes again is
+    numbered. A note says so.
+    """
+    if values.ndim < 2 or not elements:
+        return {name: values}
+    count = values.shape[1]
+    if len(elements) != count:
+        note(
+            f"{name} has {len(elements)} names for {count} numbers in {INFO_FILE}: its numbers are "
+            f"called {name}[0] to {name}[{count - 1}]"
+        )
+        return {name: values}
+    names = _different(name, elements)
+    return {f"{name}[{element}]": values[:, k] for k, element in enumerate(names)}
+
+
+def _different(feature: str, names: list[str]) -> list[str]:
+    """Return names of the numbers of a feature, those that come again with a number behind them."""
+    different: list[str] = []
+    for name in names:
+        own = name
+        number = 1
+        while own in different or (number > 1 and own in names):
+            number += 1
+            own = f"{name}_{number}"
+        if own != name:
+            note(f"{feature} calls several of its numbers {name!r}: one of them is read as {own!r}")
+        different.append(own)
+    return different

@@ -126,6 +126,17 @@ class LogSchema:
             columns.sort(key=lambda column: column.role == COMMAND)
         return columns
 
+    @property
+    def names_in_logs(self) -> tuple[str, ...]:
+        """What logs call each of the D numbers of a row; sine and cosine of an angle have one name."""
+        names: list[str] = []
+        for column in self.stream_columns:
+            numbers = 1
+            if column.wrap:
+                numbers = len(TURNED_ELEMENTS)
+            names += [column.name] * numbers
+        return tuple(names)
+
     @cached_property
     def spec(self) -> StreamSpec:
         """The stream of these columns.

@@ -97,11 +97,17 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
         raise ValueError("there are no traces to draw")
     floor, ceiling = _limits(traces)
     with figure(height=0.9 + 1.35 * len(traces)) as fig:
-        panels = fig.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        # Logs of several days have no axis in common.
+        origins = {trace.origin for trace in traces}
+        panels = fig.subplots(len(traces), 1, sharex=len(origins) == 1, sharey=True, squeeze=False)[
+            :, 0
+        ]
         for ax, trace in zip(panels, traces, strict=True):
             _surprise_panel(ax, trace)
         longest = 1.01 * max(len(trace) * trace.dt for trace in traces)
-        panels[0].set(yscale="log", ylim=(floor / 1.5, ceiling * 5), xlim=(0, longest))
+        for ax, trace in zip(panels, traces, strict=True):
+            ax.set_xlim(_start(trace), _start(trace) + longest)
+        panels[0].set(yscale="log", ylim=(floor / 1.5, ceiling * 5))
         panels[0].yaxis.set_major_locator(LogLocator(numticks=5))
         panels[0].yaxis.set_minor_formatter(NullFormatter())
         panels[-1].set_xlabel("time [s]")
@@ -146,7 +152,7 @@ def _has_fault(trace: ScoredEpisode) -> bool:
 
 
 def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
-    missing = trace.dt * np.array(spans(trace.missing))
+    missing = _begin_and_end(trace, spans(trace.missing))
     _shade(ax, missing, GREY, alpha=0.5)
     floor, ceiling = _limits([trace])
     surprise = np.clip(trace.surprise, floor, ceiling)
@@ -157,7 +163,7 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
     if trace.task:
         title += f" in {trace.task}"
     if trace.onset is not None:
-        ax.axvline(trace.onset * trace.dt, color=ORANGE, linewidth=1.5)
+        ax.axvline(_start(trace) + trace.onset * trace.dt, color=ORANGE, linewidth=1.5)
         if trace.delay is None:
             title += ": missed"
         else:
@@ -193,20 +199,30 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
     return fig
 
 
+def _start(trace: ScoredEpisode) -> float:
+    """Return when the episode began, by its own clock [s]; 0 without one."""
+    return trace.origin or 0.0
+
+
 def _times(trace: ScoredEpisode) -> Floats:
     """Return when each row was known [s]: at the end of its step."""
-    return (np.arange(len(trace)) + 1) * trace.dt  # (T,)
+    return _start(trace) + (np.arange(len(trace)) + 1) * trace.dt  # (T,)
+
+
+def _begin_and_end(trace: ScoredEpisode, rows: Sequence[tuple[int, int]]) -> Floats:
+    """Return when spans (n, 2) of rows began and ended [s]."""
+    return _start(trace) + trace.dt * np.array(rows)
 
 
 def _alarm_times(trace: ScoredEpisode) -> Floats:
     """Return when each alarm began and ended (n, 2) [s]."""
     rows = np.array(spans(trace.alarm)) + 1
-    return np.minimum(rows, len(trace)) * trace.dt
+    return _start(trace) + np.minimum(rows, len(trace)) * trace.dt
 
 
 def _shade_fault(ax: Axes, trace: ScoredEpisode) -> None:
     if trace.fault is not None:
-        times = trace.dt * np.array(spans(trace.fault))
+        times = _begin_and_end(trace, spans(trace.fault))
         _shade(ax, times, ORANGE, alpha=0.3)
 
 

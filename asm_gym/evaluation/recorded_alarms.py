@@ -11,11 +11,12 @@ from asm_gym.data.alarm_reasons import TOGETHER_S, blamed, reason
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.logs import Log
+from asm_gym.data.schema import LOG_ORIGIN, LogSchema
 from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.readings import spans
 
-HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "clock [s]", "date")
+HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date")
 FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
 
 
@@ -23,21 +24,33 @@ class Alarm(NamedTuple):
     """One alarm of a recording."""
 
     log: str
-    start: float  # [s] at the end of its first row
-    end: float  # [s]
+    # Stamps of its first and last row, by the log's own clock; without one, the ends of their steps [s].
+    start: float
+    end: float
     # The most surprising number when the alarm was raised; empty where a whole row was missing.
     channel: str
     why: str  # surprise, missing data, or not finite
     excess: float  # surprise of the worst row, in thresholds
-    stamp: float | None = None  # of its first row, by the robot's own clock [s]
+    has_stamps: bool = False  # the log has a clock
+
+    @property
+    def stamp(self) -> float | None:
+        """Stamp of its first row, by the log's own clock; None without one [s]."""
+        if self.has_stamps:
+            return self.start
+        return None
+
+    @property
+    def date(self) -> str:
+        """Date of its first row in ISO 8601; empty where the log's clock counts from elsewhere."""
+        if self.has_stamps:
+            return date_of(self.start)
+        return ""
 
     def cells(self) -> tuple[str, ...]:
         """Format for a table, under ``HEADINGS``."""
-        clock = ("", "")
-        if self.stamp is not None:
-            clock = (f"{self.stamp:.3f}", date_of(self.stamp))
         times = (f"{self.start:.3f}", f"{self.end:.3f}")
-        return (self.log, *times, self.channel, self.why, f"{self.excess:.2f}", *clock)
+        return (self.log, *times, self.channel, self.why, f"{self.excess:.2f}", self.date)
 
 
 def plain_cell(text: str) -> str:
@@ -47,22 +60,18 @@ def plain_cell(text: str) -> str:
     return text
 
 
-def alarms_of(trace: ScoredEpisode, origin: float | None = None) -> list[Alarm]:
-    """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one.
-
-    Args:
-        trace: the scored episode.
-        origin: stamp of its first row, by the robot's own clock; None without one [s].
-    """
+def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
+    """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one."""
     assert trace.attribution is not None
     assert trace.stream is not None
     alarms: list[Alarm] = []
+    times = trace.times
     newest: dict[str, int] = {}  # index of the newest alarm, by its reason
     for first, stop in spans(trace.alarm):
         row = trace.stream[first]
         why = reason(row)
-        start = (first + 1) * trace.dt
-        end = stop * trace.dt
+        start = float(times[first])
+        end = float(times[stop - 1])
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
 
         index = newest.get(why)
@@ -72,12 +81,18 @@ def alarms_of(trace: ScoredEpisode, origin: float | None = None) -> list[Alarm]:
             continue
 
         newest[why] = len(alarms)
-        alarm = Alarm(log=trace.kind, start=start, end=end, channel="", why=why, excess=excess)
+        alarm = Alarm(
+            log=trace.kind,
+            start=start,
+            end=end,
+            channel="",
+            why=why,
+            excess=excess,
+            has_stamps=trace.origin is not None,
+        )
         column = blamed(row, trace.attribution[first])
         if column is not None:
             alarm = alarm._replace(channel=trace.channels[column])
-        if origin is not None:
-            alarm = alarm._replace(stamp=origin + first * trace.dt)
         alarms.append(alarm)
     return alarms
 
@@ -90,6 +105,7 @@ def sensed_peak(trace: ScoredEpisode) -> float:
 def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[ScoredEpisode]:
     """Score logs; rows that lack a number for at most ``bridge`` seconds are not judged."""
     dt = monitor.spec.dt
+    names = LogSchema.kept_in(getattr(monitor, "about", {}), monitor.spec).names_in_logs
     surprises = monitor.score_episodes([log.episode for log in logs])
     traces = []
     for (name, episode), surprise in zip(logs, surprises, strict=True):
@@ -106,9 +122,10 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
                 surprise=judged.value,
                 excused=judged.excused_by_event,
                 attribution=judged.attribution,
-                channels=monitor.spec.labels,
+                channels=names,
                 fault=fault,
                 stream=episode.stream,
+                origin=episode.info.get(LOG_ORIGIN),
             )
         )
     return traces

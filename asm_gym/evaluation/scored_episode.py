@@ -69,6 +69,9 @@ class ScoredEpisode:
     fault: NDArray[np.bool_] | None = None  # (T,) the ground truth, for figures alone
     overridden: NDArray[np.bool_] | None = None  # (T,) the guard acted, for figures alone
     stream: Floats | None = None  # (T, D) sensed values, where they are drawn
+    origin: float | None = (
+        None  # stamp of the first row, by the log's own clock; None without one [s]
+    )
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):
@@ -87,6 +90,14 @@ class ScoredEpisode:
     def condition(self) -> str:
         """Severity and kind, in words."""
         return " ".join(part.replace("_", " ") for part in (self.severity, self.kind) if part)
+
+    @property
+    def times(self) -> Floats:
+        """(T,) the stamp of each row by the log's own clock [s]; without one, the end of its step."""
+        rows = np.arange(len(self))
+        if self.origin is None:
+            return (rows + 1) * self.dt
+        return self.origin + rows * self.dt
 
     @property
     def missing(self) -> NDArray[np.bool_]:

@@ -22,8 +22,6 @@ RATE = "rate"
 WATCHDOG = "watchdog"
 OUTPUT = "output"
 
-SAME_TIME_S = 1.0  # stamps this near to the time of the rows are not said apart from it [s]
-
 
 @dataclass(frozen=True, slots=True)
 class LiveEvent:
@@ -44,10 +42,10 @@ class LiveEvent:
     def __str__(self) -> str:
         if self.kind == SUMMARY:
             return self.text
-        at = f"{self.time:.3f} s"
-        if self.stamp is not None and abs(self.stamp - self.time) > SAME_TIME_S:
-            at += f"  (its clock: {self.stamp:.3f})"
-        return f"{at}  {self.text}"
+        time = self.time
+        if self.stamp is not None:
+            time = self.stamp
+        return f"{time:.3f} s  {self.text}"
 
     def to_json(self) -> str:
         """Return one line of JSON; a number that is not finite is text: ``"inf"``, ``"nan"``."""

@@ -133,6 +133,7 @@ class LiveWatch(Adapter):
         self._settings = settings
         self._spec = spec
         schema = settings.schema or LogSchema.kept_in(getattr(monitor, "about", {}), spec)
+        self._names = schema.names_in_logs
         self._reader = RowReader(schema, settings.clock, settings.silence_s)
         options = GuardOptions("monitor", contact_limits=None)
         self._guard = Guard(RobotFacts.unknown(spec), monitor, options, explains=False)
@@ -296,7 +297,7 @@ class LiveWatch(Adapter):
             text += f"  ({cause})"
         channel = ""
         if column is not None:
-            channel = self._spec.labels[column]
+            channel = self._names[column]
             text = f"{channel}  {text}"
         self._alarm(text, cause, channel=channel, thresholds=excess, latency_ms=latency_ms)
 

@@ -28,12 +28,11 @@ from rich.console import Console
 
 from asm_gym.data.alarm_reasons import SURPRISING
 from asm_gym.data.bridging import bridge_of, bridged
-from asm_gym.data.clock import date_of
 from asm_gym.data.dds_topics import publisher
 from asm_gym.data.live_sources import lines_from, live_source
 from asm_gym.data.logs import Log, read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.schema import LOG_ORIGIN, LogSchema
+from asm_gym.data.schema import LogSchema
 from asm_gym.evaluation import recorded_alarms
 from asm_gym.evaluation.recorded_alarms import HEADINGS, Alarm
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -115,7 +114,7 @@ class Review:
         for log, trace in zip(logs, traces, strict=True):
             is_bridged = bridged(log.episode.stream, monitor.spec.dt, bridge)  # (T,)
             self.bridged_rows += int(is_bridged.sum())
-            self.alarms += recorded_alarms.alarms_of(trace, log.episode.info.get(LOG_ORIGIN))
+            self.alarms += recorded_alarms.alarms_of(trace)
             self.excused.update(recorded_alarms.excused_in(trace))
             self.worst.append(trace)
         self.worst.sort(key=lambda trace: -recorded_alarms.sensed_peak(trace))
@@ -171,9 +170,6 @@ def say_events(reviewed: Review, notes: Sequence[str], say: Callable[[str], None
 
 def event_of(alarm: Alarm) -> LiveEvent:
     """Return an alarm of a recording as the event that a live watch makes of it."""
-    date = ""
-    if alarm.stamp is not None:
-        date = date_of(alarm.stamp)
     return LiveEvent(
         kind=ALARM,
         time=alarm.start,
@@ -182,7 +178,7 @@ def event_of(alarm: Alarm) -> LiveEvent:
         channel=alarm.channel,
         thresholds=alarm.excess,
         stamp=alarm.stamp,
-        date=date,
+        date=alarm.date,
         log=alarm.log,
     )
 
@@ -206,15 +202,11 @@ def say_table(
     say(summary)
     if not printed:
         return
-    has_stamps = any(alarm.stamp is not None for alarm in printed)
     width = max(len(alarm.channel) for alarm in printed)
     lines_of_cells = [HEADINGS, *(alarm.cells() for alarm in printed)]
     for cells in lines_of_cells:
-        log, start, end, channel, why, excess, stamp, _ = cells
-        clock = ""
-        if has_stamps:
-            clock = f"{stamp:>16}  "
-        say(f"{start:>10} {end:>10} {excess:>11}  {clock}{channel:<{width}}  {why:<12}  {log}")
+        log, start, end, channel, why, excess, _ = cells
+        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
 
 
 def schema_of(args: Args, monitor: Any) -> LogSchema:
