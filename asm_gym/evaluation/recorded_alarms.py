@@ -14,6 +14,7 @@ from asm_gym.data.logs import Log
 from asm_gym.data.schema import LOG_ORIGIN, LogSchema
 from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.monitors.blame import reattribute_alarms
 from asm_gym.readings import spans
 
 HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date")
@@ -113,21 +114,22 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
         if len(fault) != len(episode):
             fault = np.zeros(len(episode), np.bool_)
         judged = surprise.silenced(bridged(episode.stream, dt, bridge))
-        traces.append(
-            ScoredEpisode(
-                kind=name,
-                seed=0,
-                dt=dt,
-                threshold=monitor.threshold,
-                surprise=judged.value,
-                excused=judged.excused_by_event,
-                attribution=judged.attribution,
-                channels=names,
-                fault=fault,
-                stream=episode.stream,
-                origin=episode.info.get(LOG_ORIGIN),
-            )
+        trace = ScoredEpisode(
+            kind=name,
+            seed=0,
+            dt=dt,
+            threshold=monitor.threshold,
+            surprise=judged.value,
+            excused=judged.excused_by_event,
+            attribution=judged.attribution,
+            channels=names,
+            fault=fault,
+            stream=episode.stream,
+            origin=episode.info.get(LOG_ORIGIN),
         )
+        blame = getattr(monitor, "blame_", None)
+        reattribute_alarms(blame, episode.stream, trace.alarms, trace.attribution)
+        traces.append(trace)
     return traces
 
 

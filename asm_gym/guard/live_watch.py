@@ -42,6 +42,7 @@ from asm_gym.guard.live_events import (
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.step_info import RowReport
+from asm_gym.monitors.blame import FollowedBlame
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32
 
@@ -143,12 +144,14 @@ class LiveWatch(Adapter):
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
         self._unreadable_lines = 0
         self._unreadable_at = -math.inf  # arrival of the newest unreadable line [s]
+        self._blame = FollowedBlame(monitor)
         self._judge(np.zeros(spec.size), is_bridged=False)  # compiles
         self._begin()
 
     def _begin(self) -> None:
         """Forget the rows before: they are not the past of those that follow."""
         self._guard.begin()
+        self._blame.begin()
         self._bridge = Bridge(self._settings.bridge_s, self._spec.dt, self._spec.size)
         self._lost_before = 0  # rows lost before the newest one
         self._cause = ""  # why surprise is over its threshold; empty where it is not
@@ -277,6 +280,7 @@ class LiveWatch(Adapter):
     def _report_surprise(self, report: RowReport, numbers: NDArray[np.float64]) -> None:
         """Raise an alarm where surprise is over its threshold for a cause that is new."""
         robot = report.robots[0]
+        shares = self._blame.shares(numbers, bool(robot["over"]), report.attribution[0])
         if not robot["over"]:
             self._cause = ""
             return
@@ -285,7 +289,7 @@ class LiveWatch(Adapter):
         cause = self._cause or reason(numbers)
         rows_since = self.rows - self._last_rows.get(cause, -math.inf)
         if rows_since * self._spec.dt > TOGETHER_S:
-            self._alarm_surprise(cause, excess, blamed(numbers, report.attribution[0]))
+            self._alarm_surprise(cause, excess, blamed(numbers, shares))
         self._cause = cause
         self._last_rows[cause] = self.rows
 

@@ -36,6 +36,9 @@ MOST_ENTRIES = 2048
 # standardised numbers are clipped to this, so that one broken sense does not spoil all completions
 FARTHEST = 30.0
 
+USUAL = "completion_usual"  # in a checkpoint; files of earlier releases have none
+WIDEST = 8.0  # spreads from the mean that are in range where no range was learned
+NOISY_REPEATS = 2  # equal readings of a noisy sensor, where none were counted
 ARRAYS = ("completion_products", "completion_covariance", "completion_centre", "completion_error")
 
 
@@ -57,6 +60,7 @@ class Completion:
     centre: Floats  # (Y,) mean of y
     # (D,) standard deviation of a column's error when its sensor is completed [spread]; 1: actions
     error: Floats
+    usual: Floats  # (3, D) least and greatest value, and most equal readings in a row
 
     @classmethod
     def fit(cls, senses: StreamScaler, streams: Sequence[NDArray[np.floating[Any]]]) -> Self | None:
@@ -69,7 +73,8 @@ class Completion:
         Y = _entries(spec, len(products))
         if Y > MOST_ENTRIES:
             return None
-        blank = cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(spec.size))
+        usual = usual_readings(streams)
+        blank = cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(spec.size), usual)
         rows = sum(map(len, streams))
 
         def mean(part: Callable[[Floats], Floats]) -> Floats:
@@ -94,7 +99,11 @@ class Completion:
         check_shapes(learned, dict(zip(ARRAYS, shapes, strict=True)))
         if np.any((products < 0) | (products >= spec.size)):
             raise ValueError("completion_products should be columns of the stream")
-        return cls(senses, products.astype(np.intp), covariance, centre, error)
+        usual = _assumed_readings(senses)
+        if USUAL in learned:
+            check_shapes(learned, {USUAL: usual.shape})
+            usual = np.asarray(learned[USUAL], np.float64)
+        return cls(senses, products.astype(np.intp), covariance, centre, error, usual)
 
     def named(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint."""
@@ -103,6 +112,7 @@ class Completion:
             "completion_covariance": self.covariance.astype(np.float32),
             "completion_centre": self.centre,
             "completion_error": self.error,
+            USUAL: self.usual,
         }
 
     @property
@@ -180,6 +190,29 @@ class Completion:
         """Return the error (T, S), in spreads, of completing each sense's sensor from all else, for y (T, Y)."""
         centred = lifted - self.centre
         return centred[:, : len(self.spec.sensory)] - along(centred, self.each_alone)
+
+
+def usual_readings(streams: Sequence[NDArray[np.floating[Any]]]) -> Floats:
+    """Return least, greatest, and most equal readings in a row (3, D), of episodes (T, D)."""
+    least = np.min([stream.min(axis=0) for stream in streams], axis=0)
+    most = np.max([stream.max(axis=0) for stream in streams], axis=0)
+    longest = np.max([_longest_repeats(stream) for stream in streams], axis=0)
+    return np.array([least, most, longest], np.float64)
+
+
+def _longest_repeats(stream: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
+    """Return the most equal readings in a row (D,) of an episode (T, D)."""
+    rows = np.arange(1, len(stream))[:, None]
+    changed = np.where(stream[1:] != stream[:-1], rows, 0)
+    newest_change = np.maximum.accumulate(changed, axis=0)
+    return np.max(rows - newest_change, axis=0, initial=0) + 1
+
+
+def _assumed_readings(senses: StreamScaler) -> Floats:
+    """Return what ``usual_readings`` would, of a memory that has not counted."""
+    far = WIDEST * senses.spread
+    repeats = np.where(senses.spec.noise > 0, NOISY_REPEATS, np.inf)
+    return np.array([senses.mean - far, senses.mean + far, repeats])
 
 
 def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:

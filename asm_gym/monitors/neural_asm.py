@@ -21,6 +21,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, RECURRENT
 from asm_gym.memory.learning import Schedule
+from asm_gym.monitors.blame import Blame
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_config import (
@@ -140,6 +141,7 @@ class NeuralASM(CalibratedMonitor):
         self.excuses_ = BenignEvents(spec) if excuses else None
         self.values_: ValueJudge | None = None
         self._diagnosis: Diagnosis | None = None
+        self._blame: Blame | None = None
         self._kernel: RowKernel | None = None
 
     def _param(self, name: str) -> Any:
@@ -182,6 +184,16 @@ class NeuralASM(CalibratedMonitor):
         if self._diagnosis is None or self._diagnosis.completion is not completion:
             self._diagnosis = Diagnosis(completion, Readout.shipped())
         return self._diagnosis
+
+    @property
+    def blame_(self) -> Blame | None:
+        """Finds the channels that an alarm points to; None if no sense can be estimated."""
+        completion = self.model.completion_
+        if completion is None:
+            return None
+        if self._blame is None or self._blame.completion is not completion:
+            self._blame = Blame(completion)
+        return self._blame
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.data.alarm_reasons import blamed, reason
@@ -36,6 +37,7 @@ from asm_gym.guard.robot_table import Floats32
 from asm_gym.guard.step_info import RowReport
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
+from asm_gym.monitors.blame import FollowedBlame
 from asm_gym.validation import check_choice, check_number
 from asm_gym.wrappers.lerobot_arm import (
     COMMANDED,
@@ -116,6 +118,7 @@ class LeRobotGuard(Adapter):
         self._sent: dict[str, float] = {}  # the newest finite number that was sent, by name
         self._pace = Pace(self._spec.dt)
         self._history = ServoHistory(self._spec.dt)
+        self._blame = FollowedBlame(self.monitor)
         self.alarm = False
         self.intervened = False
         self.last_alarm: dict[str, Any] = {}
@@ -229,9 +232,11 @@ class LeRobotGuard(Adapter):
         report = reports[-1]
         was_alarm = self.alarm
         self.alarm = bool(report.robots["alarm"][0])
+        row = row_of(target, self._columns)[0]
+        shares = self._blame.shares(row, self.alarm, report.attribution[0])
         if not self.alarm:
             return
-        self.last_alarm = self._description(report, target)
+        self.last_alarm = self._description(report, row, shares, target)
         if not (was_alarm or report.robots["overridden"][0]):
             _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
 
@@ -296,10 +301,11 @@ class LeRobotGuard(Adapter):
         """Return (1, A) the numbers of an action; NaN where one is missing."""
         return np.array([[number_of(action, name) for name in self._names]], np.float32)
 
-    def _description(self, report: RowReport, step: LoopStep) -> dict[str, Any]:
-        """Return what there is to say of an alarm."""
+    def _description(
+        self, report: RowReport, row: Floats32, shares: NDArray[np.float64], step: LoopStep
+    ) -> dict[str, Any]:
+        """Return what there is to say of an alarm in a row (D,), by the shares (D,) of its numbers."""
         robot = report.robots[0]
-        row = row_of(step, self._columns)[0]
         cause = reason(row)
         if report.failures:
             cause = FAILURE
@@ -307,7 +313,7 @@ class LeRobotGuard(Adapter):
             cause = OUT_OF_RANGE
         channel = ""
         motor = ""
-        column = blamed(row, report.attribution[0])
+        column = blamed(row, shares)
         if column is not None:
             channel = self._spec.labels[column]
             motor = self._columns[column].motor
