@@ -3,6 +3,7 @@
     M v̇ = τ - g(q) - 3 D v - D tanh(20 v)/2      D: the diagonal of M;  g with a load that is drawn for each episode
     τ   = 60 D (u - v) + ĝ(q)                     the drive: a velocity loop, with gravity compensated for a load of 1
 
+A payload of m kg at the hand adds m g times the horizontal distance from each joint that bears gravity to the hand.
 Masses and gains resemble those of a seven-joint arm of 20 kg.
 """
 
@@ -24,6 +25,8 @@ CONTROL_PERIOD_S = 0.01  # control period [s]
 FASTEST_COMMAND = 3.0  # command [rad/s]
 MASS = np.array([2.5, 2.5, 1.5, 1.5, 0.5, 0.5, 0.2])  # [kg m²]
 GRAVITY_TORQUE = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]
+LINK_LENGTHS = np.array([0.3, 0.3, 0.25, 0.2, 0.1, 0.08, 0.05])  # [m]
+STANDARD_GRAVITY = 9.81  # [m/s²]
 COUPLING = 0.15  # between neighbouring joints, as a share of the geometric mean of their masses
 
 
@@ -34,24 +37,52 @@ def _gravity(position: Floats) -> Floats:
 
 
 @compiled
+def _payload_torque(position: Floats) -> Floats:
+    """Return the torques (7,) by which a payload of 1 kg at the hand loads the joints that bear gravity."""
+    lever = LINK_LENGTHS * np.sin(np.cumsum(position) + 0.5)  # horizontal extent of each link [m]
+    torque = np.zeros(JOINTS)
+    beyond = 0.0
+    for joint in range(JOINTS - 1, -1, -1):
+        beyond += lever[joint]
+        if GRAVITY_TORQUE[joint] > 0:
+            torque[joint] = STANDARD_GRAVITY * beyond
+    return torque
+
+
+@compiled
 def _advance(
-    q: Floats, v: Floats, command: Floats, load: float, inverse: Floats
+    q: Floats, v: Floats, command: Floats, loads: tuple[float, float], inverse: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return position, velocity and torque (7,) after a control step; ``inverse`` is that of M."""
+    """Return position, velocity and torque (7,) after a control step.
+
+    Args:
+        q: positions (7,) [rad].
+        v: velocities (7,) [rad/s].
+        command: commanded velocities (7,) [rad/s].
+        loads: of the links, 1 where the drive compensates for all, and the payload [kg].
+        inverse: of M.
+    """
+    load, payload = loads
     dt = CONTROL_PERIOD_S / SUBSTEPS
     torque = command
     for _ in range(SUBSTEPS):
         compensated = _gravity(q)
         torque = 60 * MASS * (command - v) + compensated
         friction = 3 * MASS * v + 0.5 * MASS * np.tanh(20 * v)
-        accelerating = torque - load * compensated - friction
+        weight = load * compensated + payload * _payload_torque(q)
+        accelerating = torque - weight - friction
         v = v + dt * (inverse @ accelerating)
         q = q + dt * v
     return q, v, torque
 
 
 class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Observe noisy positions [rad], velocities [rad/s] and torques [N m] of the joints; actions are velocities."""
+    """Observe noisy positions [rad], velocities [rad/s] and torques [N m] of the joints; actions are velocities.
+
+    Args:
+        horizon: steps of an episode.
+        payload: at the hand [kg]; may be changed at any time.
+    """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
     stream_spec = StreamSpec(
@@ -67,8 +98,9 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     dt = CONTROL_PERIOD_S
     action_means = "velocity"
 
-    def __init__(self, horizon: int = 400) -> None:
+    def __init__(self, horizon: int = 400, payload: float = 0.0) -> None:
         self.horizon = horizon
+        self.payload = payload
         sensed = 3 * JOINTS
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (sensed,), np.float32)
         self.action_space = gym.spaces.Box(-FASTEST_COMMAND, FASTEST_COMMAND, (JOINTS,), np.float32)
@@ -93,7 +125,8 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move one step by the commanded velocities [rad/s]."""
         command = np.clip(np.asarray(action, np.float64), -FASTEST_COMMAND, FASTEST_COMMAND)
-        self._q, self._v, torque = _advance(self._q, self._v, command, self._load, self._inverse)
+        loads = (self._load, self.payload)
+        self._q, self._v, torque = _advance(self._q, self._v, command, loads, self._inverse)
         self._steps += 1
         truncated = self._steps >= self.horizon
         observation = self._sense(torque)

@@ -74,12 +74,12 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
     rows = episode(500).stream[:30]
     count, said = watched(lines(rows, dies=True), monitor)
     assert count
-    assert "0.600 s  the source has died, nothing came for 2 s: an alarm" in said
+    assert "0.580 s  the source has died, nothing came for 2 s: an alarm" in said
     assert "30 rows, 1 alarm;" in said
     kept = np.delete(np.arange(30), [12, 13])
     count, said = watched(lines(rows[kept], DT * kept), monitor)
     assert count
-    assert "0.260 s  2 rows lost: an alarm (late)" in said
+    assert "0.280 s  2 rows lost: an alarm (late)" in said
     assert said.splitlines()[-1].startswith("30 rows, ")
     assert watched(lines(rows[kept], DT * kept), monitor, bridge_s=0.05)[0] == 0
 
@@ -168,7 +168,7 @@ def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, mon
     count, said = watched(lines(episode(501).stream[:30]), asm)
     assert not count
     assert said.count("knock") == 1
-    assert "0.120 s  knock: no alarm" in said
+    assert "0.100 s  knock: no alarm" in said
     trace = ScoredEpisode(
         "log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])}
     )
