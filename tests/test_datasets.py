@@ -1,5 +1,6 @@
 """Recording into Minari datasets, going on after a kill, and reading what others recorded."""
 
+import json
 import os
 import signal
 import subprocess
@@ -23,7 +24,8 @@ from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.cli import main
-from asm_gym.wrappers import StreamRecorder
+from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
+from tests.fakes import CueMonitor, FakeEnv
 from tests.streams import sine_episodes
 
 ONE = ("--workers", "1", "--episodes")
@@ -155,6 +157,21 @@ def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7, changed
         {"dataset_id": "somebody/thing-v0", "minari_version": minari.__version__}
     )
     return buffers
+
+
+def test_minari_keeps_what_a_guard_reports(tmp_path):
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([3]), on_alarm="monitor")
+    infos = [env.reset(seed=0)[1]]
+    infos += [env.step(np.zeros(3, np.float32))[4] for _ in range(10)]
+    columns = {name: [info[name] for info in infos] for name in infos[0]}
+    foreign(tmp_path / "data", episodes=1, infos=columns)
+    with h5py.File(tmp_path / "data" / "main_data.hdf5") as file:
+        kept = file["episode_0/infos"]
+        assert kept.keys() == infos[0].keys()
+        np.testing.assert_array_equal(kept["asm_alarm"], [info["asm_alarm"] for info in infos])
+        alarms = [json.loads(text)["alarm"] for text in kept["asm"]]
+    assert alarms == [info["asm"]["alarm"] for info in infos]
+    assert sum(alarms) == 1
 
 
 def test_a_dataset_of_somebody_elses_environment_is_read_as_observation_and_action(tmp_path):

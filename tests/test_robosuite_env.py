@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import robots
 from asm_gym.policies import make_policy
 from asm_gym.spec import MOTOR
@@ -60,6 +61,11 @@ def test_the_stream_is_named_number_by_number(lift):
     assert info["stream"].shape == (spec.size,) == (len(spec.labels),)
     assert info["stream"].dtype == np.float32
     assert info["success"] is False
+    lift.contact_limits = ContactLimits()  # as a guard sets them
+    stepped_info = lift.step(np.zeros(7, np.float32))[4]
+    assert {name: np.shape(value) for name, value in info.items()} == {
+        name: np.shape(value) for name, value in stepped_info.items()
+    }
     assert spec.dt == pytest.approx(0.05)
     assert {c.group for c in spec.channels} == {
         "joint",

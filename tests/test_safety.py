@@ -32,6 +32,7 @@ def test_monitor_reports_and_never_touches_the_action():
     assert [i["asm"]["alarm"] for i in infos[1:]] == [False] * 3 + [True] * 2 + [False] * 3
     assert [i["cost"] for i in infos] == [0.0] * 4 + [1.0] * 2 + [0.0] * 3
     assert all(set(i["asm"]) == set(infos[0]["asm"]) for i in infos)
+    assert all(set(i) == set(infos[0]) for i in infos)
     assert not any(i["asm"]["intervened"] for i in infos)
     assert all(np.array_equal(a, ACT) for a in env.unwrapped.actions)
 

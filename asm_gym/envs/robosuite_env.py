@@ -286,7 +286,7 @@ class RobosuiteEnv(SteppedEnv):
             reward = 0.0
             success = False
         info = self._info(success, unstable)
-        if self._row_substeps < self.substeps and "stream" in info:
+        if "streams" in info:
             info["streams"] = np.stack([*self._rows, info["stream"]])
         terminated = self.terminate_on_success and success
         truncated = self._steps_taken >= self.horizon or unstable
@@ -299,6 +299,9 @@ class RobosuiteEnv(SteppedEnv):
         info: dict[str, Any] = {}
         if self._senses.stream_spec is not None:
             info["stream"] = self._reading.stream
+            rows = self.substeps // self._row_substeps
+            if rows > 1:
+                info["streams"] = np.repeat(info["stream"][None], rows, axis=0)
         info["success"] = success
         info["is_success"] = self._solved
         info |= self._forces(unstable)

@@ -53,10 +53,10 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         self.keeps_holding = False
         """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
         self.contact_limits: ContactLimits | None = None
-        """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then holds ``contact_load``,
+        """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then tells ``contact_load``,
         the largest share of a limit that was reached within the step, ``contact_left_s``, when in it a limit was passed
         [s], infinite where none was, ``contact_felt``, the step's mean load, and ``braked``, the share of its substeps
-        in which an arm was slowed down beneath its controller."""
+        in which an arm was slowed down beneath its controller; without limits these are NaN, and ``braked`` 0."""
         self._limits_of_guards: dict[str, ContactLimits | None] = {}
 
     @property
@@ -159,19 +159,26 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         )
 
     def _forces(self, unstable: bool) -> dict[str, Any]:
-        """Return what ``info`` says of contact; NaN, or infinite, where the simulation diverged."""
+        """Return what ``info`` says of contact: NaN without limits; NaN or infinite where the simulation diverged."""
         simulation = self.simulation
-        forces: dict[str, Any] = {"contact_force": simulation.contact_force}
+        felt = simulation.felt_mean
+        forces: dict[str, Any] = {
+            "contact_force": simulation.contact_force,
+            "braked": 0.0,
+            "contact_load": np.nan,
+            "contact_left_s": np.nan,
+            "contact_felt": np.full_like(felt, np.nan),
+        }
         if self.contact_limits is not None:
             forces["braked"] = simulation.braked
             forces["contact_load"] = simulation.load
             forces["contact_left_s"] = np.inf
             if simulation.passed_limit is not None:
                 forces["contact_left_s"] = (simulation.passed_limit + 1) / PHYSICS_FREQ
-            forces["contact_felt"] = simulation.felt_mean
+            forces["contact_felt"] = felt
         if unstable:
             forces["contact_force"] = np.nan
-            if "contact_load" in forces:
+            if self.contact_limits is not None:
                 forces["contact_load"] = np.inf
         return forces
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -228,8 +229,17 @@ class LazyInfo(dict[str, Any]):
         if make is not None:
             dict.update(self, {**make(), **dict.copy(self)})
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.bytes_]:
+        """Return its content as JSON, one text: so Minari writes it with ``record_infos=True``."""
+        return np.array(json.dumps(self, default=_plain), np.bytes_)
+
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         return dict, (dict(self),)
+
+
+def _plain(value: Any) -> Any:
+    """Return an array, or a number of NumPy, as JSON holds it."""
+    return value.tolist()
 
 
 def _filled_first(name: str) -> Callable[..., Any]:

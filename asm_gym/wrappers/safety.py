@@ -151,6 +151,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             self.guard.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
         self._executed = np.zeros(0, np.float32)
+        info["overridden"] = bool(info.get("overridden"))
         self.report_step([report], info)
         return observation, info
 

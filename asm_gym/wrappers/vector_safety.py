@@ -144,6 +144,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if begun.all():
             self._take_over_changed_monitor()
         infos = dict(infos)
+        infos["overridden"] = np.zeros(self.num_envs, bool) | infos.get("overridden", False)
+        infos["_overridden"] = begun
         self._present = begun
         self._commanded = np.full(self._flat_shape, np.nan, np.float32)
         self._executed = self._commanded
