@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from asm_gym.data.schema import LogSchema as LogSchema
     from asm_gym.exceptions import AsmGymError as AsmGymError
     from asm_gym.exceptions import DamagedFile as DamagedFile
+    from asm_gym.exceptions import LimitsLacking as LimitsLacking
     from asm_gym.exceptions import NotEnoughEpisodes as NotEnoughEpisodes
     from asm_gym.exceptions import NotFitted as NotFitted
     from asm_gym.exceptions import SpecMismatch as SpecMismatch

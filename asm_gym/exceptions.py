@@ -5,6 +5,7 @@ AsmGymError                  a ValueError
 ├── NotFitted                a monitor has not learned yet; a RuntimeError too
 ├── NotEnoughEpisodes        too few episodes to promise a rate of false alarms
 ├── UnsupportedEnvironment   an environment that cannot be guarded as asked
+├── LimitsLacking            a format of limits needs what a memory does not keep
 └── DamagedFile              a file that cannot be read
 """
 
@@ -15,6 +16,7 @@ from collections.abc import Sequence
 __all__ = [
     "AsmGymError",
     "DamagedFile",
+    "LimitsLacking",
     "NotEnoughEpisodes",
     "NotFitted",
     "SpecMismatch",
@@ -105,6 +107,33 @@ class UnsupportedEnvironment(AsmGymError):
         if self.advice:
             return f"{self.reason}: {self.advice}"
         return self.reason
+
+
+class LimitsLacking(AsmGymError):
+    """A format of limits needs a sense that a memory lacks, or of which it keeps no range.
+
+    Args:
+        form: the format.
+        needed: what it needs.
+        kinds: what the memory keeps limits of.
+        channels: that it has.
+    """
+
+    def __init__(
+        self, form: str, needed: str, kinds: Sequence[str], channels: Sequence[str]
+    ) -> None:
+        super().__init__(form, needed, kinds, channels)
+        self.form = form
+        self.needed = needed
+        self.kinds = kinds
+        self.channels = channels
+
+    def __str__(self) -> str:
+        return (
+            f"{self.form} needs {self.needed}; this memory keeps limits of "
+            f"{', '.join(self.kinds) or 'nothing'}; its channels are {', '.join(self.channels)}. "
+            "A memory that was calibrated by an older version keeps less: calibrate it anew"
+        )
 
 
 class DamagedFile(AsmGymError):

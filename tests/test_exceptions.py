@@ -15,6 +15,7 @@ from asm_gym.detection.conformal import check_hours, conformal_threshold
 from asm_gym.exceptions import (
     AsmGymError,
     DamagedFile,
+    LimitsLacking,
     NotEnoughEpisodes,
     NotFitted,
     SpecMismatch,
@@ -38,7 +39,7 @@ def test_a_monitor_that_has_not_learned_is_not_fitted():
     monitor = NeuralASM(SPEC)
     with pytest.raises(NotFitted, match="call fit"):
         monitor.initial_state()
-    with pytest.raises(NotFitted, match="call calibrate"):
+    with pytest.raises(NotFitted, match="call fit"):  # calibrate would refuse it
         _ = monitor.threshold
 
 
@@ -74,6 +75,7 @@ def test_what_is_no_checkpoint_is_a_damaged_file(tmp_path):
         NotFitted("this monitor", "has no threshold", "calibrate(episodes)"),
         NotEnoughEpisodes("a rate of 0.05 needs", "19 episodes", "5", "record more"),
         UnsupportedEnvironment("it changes actions", "put it outside"),
+        LimitsLacking("franka", "torques", ("force",), ("wrist_force",)),
         DamagedFile("memory.asm", "it is empty"),
     ],
 )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
+from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_comparison import refuse_other_scales
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
@@ -20,6 +21,7 @@ from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
+from asm_gym.detection.healthy_ranges import healthy_ranges
 from asm_gym.exceptions import NotFitted
 from asm_gym.monitors.calibration import (
     AlarmRate,
@@ -30,6 +32,7 @@ from asm_gym.monitors.calibration import (
 from asm_gym.monitors.monitor_files import read_monitor, threshold_below, write_monitor
 from asm_gym.monitors.monitor_protocol import Progress, Surprise
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows, surprise_of_stream
+from asm_gym.monitors.robot_limits import MARGIN, RobotLimits, limits_of
 from asm_gym.monitors.stream_model import (
     StreamModel,
     error_shares,
@@ -70,6 +73,8 @@ class CalibratedMonitor:
         pace_: by task, (N, 16) speed of the hands in these episodes by place and direction; see ``HandSpeedMap``.
         motion_: how hands move by commands (``detection.commands``); None without hands.
         commands_: (3, A) least, most and greatest step of the commands of these episodes; None without.
+        ranges_: (8, D) how far each number went in these episodes (``detection.healthy_ranges``); None in files of
+            earlier versions.
     """
 
     model: StreamModel
@@ -80,6 +85,7 @@ class CalibratedMonitor:
     pace_: dict[str, NDArray[np.float32]]
     motion_: NDArray[np.floating[Any]] | None
     commands_: NDArray[np.floating[Any]] | None
+    ranges_: NDArray[np.floating[Any]] | None
 
     def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
         if not detections:
@@ -308,6 +314,15 @@ class CalibratedMonitor:
         self.pace_ = HandSpeedMap.by_task(episodes, self.spec)
         self.motion_ = learned_motion(streams, self.spec)
         self.commands_ = healthy_commands(streams, self.spec)
+        meaning: ActionMeaning | None = None
+        if ACTIONS in self.about:
+            meaning = ActionMeaning.from_json(self.about[ACTIONS])
+        self.ranges_ = healthy_ranges(streams, self.spec, meaning)
+
+    @typed
+    def limits(self, margin: float = MARGIN) -> RobotLimits:
+        """Return what healthy motion needs, as limits for the robot; raises as ``robot_limits.limits_of`` does."""
+        return limits_of(self, margin)
 
     @property
     def threshold(self) -> float:
@@ -438,13 +453,15 @@ class CalibratedMonitor:
         self.pace_ = {}
         self.motion_ = None
         self.commands_ = None
+        self.ranges_ = None
 
     @property
     def _name(self) -> str:
         return f"{self.model.kind} monitor"
 
     def _lacking(self, what: str) -> NotFitted:
-        """Return the error of a monitor that is not calibrated."""
+        """Return the error of a monitor that is not calibrated. Raises that of one that is not even fitted."""
+        self._require_fitted()
         return NotFitted(f"this {self._name}", f"has no {what}", "calibrate(nominal_episodes)")
 
     def _copy(self) -> Self:

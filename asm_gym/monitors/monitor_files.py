@@ -27,6 +27,7 @@ OPTIONAL = {
     "ceilings_from_": "ceilings_from",
     "motion_": "motion",
     "commands_": "commands",
+    "ranges_": "ranges",
 }
 """The array of a checkpoint that keeps each attribute that may be None."""
 

@@ -1,0 +1,224 @@
+"""What healthy motion needs, as limits that a robot can be given.
+
+    limit = margin · greatest healthy |value|                   torque, force, current, speed, distance of a target
+    range = [least - p r, most + p r],  r = most - least        position; within the joint's stops
+
+A healthy row is near a limit beyond ``NEAR`` of it, near the end of a range within p r of it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from asm_gym.detection.contact_limits import LIMITED
+from asm_gym.detection.hand_speed import AXES
+from asm_gym.detection.hand_speed_map import FASTEST_COLUMNS
+from asm_gym.detection.healthy_ranges import LEAD, Floats, share_beyond
+from asm_gym.exceptions import NotFitted
+from asm_gym.spec import MOTOR, Channel
+from asm_gym.validation import check_number
+
+MARGIN = 1.25
+NEAR = 0.75  # share of a limit
+RANGE_MARGIN = 0.05  # p
+
+EXTERNAL_TORQUE = "external torque"
+FORCE = "force"
+TORQUE_AT_HAND = "hand torque"
+POSITION = "joint position"
+JOINT_SPEED = "joint speed"
+HAND_SPEED = "hand speed"
+TURNING_SPEED = "turning speed"
+CURRENT = "current"
+TARGET_DISTANCE = "distance of the target"
+
+KINDS = {
+    EXTERNAL_TORQUE: r"ext\w*[_ .]?(torque|tau|effort)|(torque|tau|effort)\w*[_ .]?ext",
+    TORQUE_AT_HAND: r"(wrist|wrench|tcp|ee|hand|flange)\w*[_ .]?torque",
+    FORCE: r"(wrist|wrench|tcp|ee|hand|flange)\w*[_ .]?force",
+    TURNING_SPEED: r"(hand|tcp|ee)\w*angular",
+    HAND_SPEED: r"(hand|tcp|ee)\w*(vel|speed)",
+    CURRENT: r"current",
+    JOINT_SPEED: r"joint\w*[_ .]?(vel|speed)|^(qd|dq|qvel|velocity|velocities|vel)$|\.vel$",
+    POSITION: r"joint\w*[_ .]?(pos|angle)|^(q|qpos|position|positions|pos)$|\.pos$|observation\.state",
+}
+"""What a channel senses, by its name; the first that fits counts."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One number that a robot can be limited in.
+
+    Attributes:
+        kind: what is limited, of ``KINDS`` or ``TARGET_DISTANCE``.
+        label: of the number in the stream.
+        unit: of all four values.
+        low, high: the limit, with its margin.
+        least, most: of healthy motion.
+        near: share of healthy rows that come near the limit; None if the memory has not kept it.
+    """
+
+    kind: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    least: float
+    most: float
+    near: float | None = None
+
+
+@dataclass(frozen=True)
+class RobotLimits:
+    """What healthy motion of a robot needs.
+
+    Attributes:
+        robot: its name; empty if unknown.
+        rate: of the rows [Hz].
+        margin: of the limits over healthy motion.
+        limits: one for each number, in the order of the stream.
+        senses: names of all channels that the memory has.
+    """
+
+    robot: str
+    rate: float
+    margin: float
+    limits: tuple[Limit, ...]
+    senses: tuple[str, ...]
+
+    def of(self, kind: str) -> tuple[Limit, ...]:
+        """Return the limits of a kind; empty without any."""
+        return tuple(limit for limit in self.limits if limit.kind == kind)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, as JSON holds them."""
+        return {
+            "robot": self.robot,
+            "rate_hz": self.rate,
+            "margin": self.margin,
+            "limits": [asdict(limit) for limit in self.limits],
+        }
+
+
+def limits_of(monitor: Any, margin: float = MARGIN) -> RobotLimits:
+    """Return what healthy motion needs, by the episodes that a monitor was calibrated on.
+
+    A memory that was calibrated before ranges were kept knows its forces and the speed of its hands alone.
+
+    Args:
+        monitor: a ``CalibratedMonitor``.
+        margin: of limits over the greatest healthy value, at least 1.
+
+    Raises:
+        NotFitted: it is not calibrated.
+        ValueError: the margin is below 1.
+    """
+    check_number("margin", margin, low=1.0)
+    if monitor.threshold_ is None:
+        raise NotFitted("this monitor", "has no healthy ranges", "calibrate(nominal_episodes)")
+    spec = monitor.spec
+    if monitor.ranges_ is None:
+        limits = [*_of_forces(monitor, margin), *_of_pace(monitor, margin)]
+    else:
+        limits = list(_of_ranges(monitor, margin))
+    return RobotLimits(
+        robot=spec.source,
+        rate=1.0 / spec.dt,
+        margin=margin,
+        limits=tuple(limits),
+        senses=tuple(channel.name for channel in spec.channels),
+    )
+
+
+def kind_of(channel: Channel) -> str:
+    """Return what a channel senses that a robot can be limited in; empty for anything else."""
+    name = channel.name.lower().removesuffix("_peak")
+    if channel.group == MOTOR or "gripper" in name:
+        return ""
+    for kind, pattern in KINDS.items():
+        if re.search(pattern, name):
+            return kind
+    return ""
+
+
+def _of_ranges(monitor: Any, margin: float) -> Iterator[Limit]:
+    """Yield the limits of all senses, by the ranges that ``calibrate`` has kept."""
+    spec = monitor.spec
+    ranges = monitor.ranges_
+    for channel in spec.channels:
+        part = spec.slices[channel.name]
+        columns = range(*part.indices(spec.size))
+        has_peak = f"{channel.name}_peak" in spec.slices
+        if channel.group == MOTOR:
+            yield from _of_targets(channel, ranges, columns, margin)
+        elif has_peak or not kind_of(channel):
+            continue
+        elif kind_of(channel) == POSITION:
+            yield from _of_positions(channel, ranges, columns)
+        else:
+            for label, column in zip(channel.labels, columns, strict=True):
+                least, most = ranges[0, column], ranges[5, column]
+                bound = margin * max(abs(least), abs(most))
+                near = share_beyond(ranges, column, -NEAR * bound, NEAR * bound)
+                yield _symmetric(kind_of(channel), label, channel.unit, bound, (least, most), near)
+
+
+def _of_positions(channel: Channel, ranges: Floats, columns: range) -> Iterator[Limit]:
+    stops = channel.stops or ((-np.inf, np.inf),) * channel.size
+    for label, column, stop in zip(channel.labels, columns, stops, strict=True):
+        least, most = float(ranges[0, column]), float(ranges[5, column])
+        room = RANGE_MARGIN * (most - least)
+        low = max(least - room, min(stop[0], least))
+        high = min(most + room, max(stop[1], most))
+        near = share_beyond(ranges, column, low + room, high - room)
+        yield Limit(POSITION, label, channel.unit, low, high, least, most, near)
+
+
+def _of_targets(channel: Channel, ranges: Floats, columns: range, margin: float) -> Iterator[Limit]:
+    for label, column in zip(channel.labels, columns, strict=True):
+        lead = float(ranges[LEAD, column])
+        if lead > 0:
+            yield _symmetric(TARGET_DISTANCE, label, channel.unit, margin * lead, (-lead, lead))
+
+
+def _of_forces(monitor: Any, margin: float) -> Iterator[Limit]:
+    """Yield the limits of forces and torques by ``healthy_``, which leaves the hardest episodes out."""
+    kinds = dict(zip(LIMITED, (EXTERNAL_TORQUE, FORCE), strict=True))
+    values = iter(monitor.healthy_)
+    for channel in monitor.spec.channels:
+        if not channel.name.endswith(LIMITED):
+            continue
+        kind = next(kind for name, kind in kinds.items() if channel.name.endswith(name))
+        for label, most in zip(channel.labels, values, strict=False):
+            yield _symmetric(kind, label, channel.unit, margin * most, (-most, most))
+
+
+def _of_pace(monitor: Any, margin: float) -> Iterator[Limit]:
+    """Yield the limits of the hand's speed by ``pace_``, which leaves the fastest episodes out."""
+    if not monitor.pace_:
+        return
+    cells = np.concatenate(list(monitor.pace_.values()))[:, FASTEST_COLUMNS]
+    fastest = cells.max(axis=0).reshape(2, AXES).max(axis=0)  # along and against each axis
+    for axis, most in enumerate(fastest.tolist()):
+        kind, unit, name = HAND_SPEED, "m/s", "hand_velocity"
+        if axis >= 3:
+            kind, unit, name = TURNING_SPEED, "rad/s", "hand_angular_velocity"
+        label = f"{name}[{axis % 3}]"
+        yield _symmetric(kind, label, unit, margin * most, (-most, most))
+
+
+def _symmetric(
+    kind: str,
+    label: str,
+    unit: str,
+    bound: float,
+    healthy: tuple[float, float],
+    near: float | None = None,
+) -> Limit:
+    least, most = map(float, healthy)
+    return Limit(kind, label, unit, -float(bound), float(bound), least, most, near)
