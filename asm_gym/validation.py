@@ -161,7 +161,7 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
     known_names = list(map(str, names))
     hint = ""
     if isinstance(got, str):
-        for near in difflib.get_close_matches(got[:SHOWN_CHARACTERS], known_names, 1, 0.75):
+        for near in difflib.get_close_matches(got[:SHOWN_CHARACTERS], known_names, 1):
             hint = f"; did you mean {near!r}?"
     raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(known_names)}{hint}")
 
@@ -209,8 +209,10 @@ def typed(call: Callable[P, R]) -> Callable[P, R]:
         kinds = _kinds(call)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name in kinds and not _fits(value, kinds[name]):
-                annotation = signature.parameters[name].annotation
-                raise ArgumentTypeError(f"{name} must be {annotation}, got {short_repr(value)}")
+                wanted = signature.parameters[name].annotation
+                if _is_union(kinds[name]):  # which may be hidden by an alias
+                    wanted = _in_words(kinds[name])
+                raise ArgumentTypeError(f"{name} must be {wanted}, got {short_repr(value)}")
         return call(*args, **kwargs)
 
     return checked
@@ -234,7 +236,7 @@ def _kinds(call: Callable[..., Any]) -> dict[str, Any]:
 def _fits(value: Any, kind: Any) -> bool:
     """Return whether a value is of an annotated type."""
     origin = get_origin(kind) or kind
-    if origin in (typing.Union, UnionType):
+    if _is_union(kind):
         return any(_fits(value, each) for each in get_args(kind))
     if origin is Sequence:
         (item_kind,) = get_args(kind)
@@ -244,6 +246,26 @@ def _fits(value: Any, kind: Any) -> bool:
     if getattr(origin, "_is_protocol", False):
         return all(callable(getattr(value, name, None)) for name in _methods(origin))
     return isinstance(value, origin)
+
+
+def _is_union(kind: Any) -> bool:
+    return get_origin(kind) in (typing.Union, UnionType)
+
+
+def _in_words(kind: Any) -> str:
+    """Return an annotated type as a message names it, such as ``str, an object with predict() or a function``."""
+    if _is_union(kind):
+        *others, last = [_in_words(each) for each in get_args(kind)]
+        return f"{', '.join(others)} or {last}"
+    origin = get_origin(kind) or kind
+    if origin is Callable:
+        return "a function"
+    if getattr(origin, "_is_protocol", False):
+        methods = [f"{method}()" for method in _methods(origin)]
+        return f"an object with {' and '.join(methods)}"
+    if origin is type(None):
+        return "None"
+    return getattr(origin, "__name__", str(kind))
 
 
 def _is_listed(value: Any) -> bool:

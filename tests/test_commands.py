@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -55,7 +56,28 @@ def run(*argv: str, work=lambda args, console: None) -> int:
 @pytest.mark.parametrize("name", EVERY_COMMAND)
 def test_every_command_prints_its_help(name, capsys):
     assert cli.main([*name.split(), "--help"]) == 0
-    assert f"usage: asm-gym {name}" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f"usage: asm-gym {name}" in shown
+    assert "default: ''" not in shown
+    assert "{None}" not in shown
+
+
+def completed(*words: str) -> list[str]:
+    """What bash offers for the last of the words."""
+    ask = (
+        f"{sys.executable} -m asm_gym completion bash > script && source ./script && "
+        f"COMP_WORDS=({shlex.join(words)}) COMP_CWORD={len(words) - 1} && _asm_gym && "
+        'echo "${COMPREPLY[@]}"'
+    )
+    return subprocess.check_output(["bash", "-c", ask], text=True).split()
+
+
+def test_bash_completes_commands_options_and_studies(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.chdir(tmp_path)
+    assert completed("asm-gym", "fi") == ["fit"]
+    assert completed("asm-gym", "fit", "logs", "--false-alarms") == ["--false-alarms-per-hour"]
+    assert completed("asm-gym", "reproduce", "rep") == ["repertoire"]
 
 
 @pytest.mark.parametrize("name", EVERY_COMMAND)
@@ -85,7 +107,12 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
 
 @pytest.mark.parametrize(
     ("typed", "near"),
-    [("docter", "doctor"), ("reproduce pandas", "panda"), ("watch --monitr x", "--monitor")],
+    [
+        ("docter", "doctor"),
+        ("fti", "fit"),
+        ("reproduce pandas", "panda"),
+        ("watch --monitr x", "--monitor"),
+    ],
 )
 def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2

@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -222,6 +223,22 @@ def memory(logs):
     return file
 
 
+def test_few_logs_promise_what_they_can(logs, tmp_path, capsys):
+    few = tmp_path / "few"
+    few.mkdir()
+    for n in range(20):
+        shutil.copy(logs / f"run{n:02}.csv", few)
+    out = tmp_path / "few.asm"
+    assert main(["fit", str(few), "--out", str(out), *FIT]) == 0
+    assert "at most one false alarm in 11; 38 promise one in 20" in capsys.readouterr().out
+    monitor = load_monitor(out)
+    assert len(monitor.maxima_) == 10
+    assert monitor.promise.rate == pytest.approx(1 / 11)
+    for n in range(7, 20):  # too few for any promise
+        (few / f"run{n:02}.csv").unlink()
+    assert main(["fit", str(few), "--out", str(out), *FIT]) == 2
+
+
 def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, capsys):
     out = tmp_path / "x.asm"
     assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01"]) == 2
@@ -332,7 +349,7 @@ def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fit", "nowhere"], "there is no nowhere"),
+        (["fit", "nowhere"], "nowhere does not exist"),
         (["fit", "nowhere", "--monitor", "asm"], "unknown monitor 'asm'"),
         (["fit", "nowhere", "--split", "0"], "split must be"),
         (["fit", "nowhere", "--rate", "-1"], "rate must be"),

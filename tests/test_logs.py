@@ -491,7 +491,7 @@ def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda p: None, FileNotFoundError, "there is no"),
+        (lambda p: None, FileNotFoundError, "does not exist"),
         (
             lambda p: p.mkdir(),
             FileNotFoundError,

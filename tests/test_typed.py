@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from asm_gym.policies.policy import Policy
 from asm_gym.validation import ArgumentTypeError, typed
+
+Policies = str | Path | Policy | Callable[[object], Policy]
 
 
 @typed
@@ -59,6 +62,17 @@ def test_what_an_annotation_says_is_taken(arguments):
 def test_any_other_type_is_refused_by_name_and_value(name, value):
     with pytest.raises(ArgumentTypeError, match=rf"^{name} must be .*, got "):
         call(**({"path": "a"} | {name: value}))
+
+
+@typed
+def act(policy: Policies) -> None: ...
+
+
+def test_an_alias_of_several_types_is_spelled_out():
+    with pytest.raises(
+        ArgumentTypeError, match=r"^policy must be (?!Policies).*predict\(\).*, got <obj"
+    ):
+        act(object())
 
 
 def test_a_function_keeps_its_name_and_its_own_errors():

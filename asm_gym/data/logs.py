@@ -257,7 +257,7 @@ def _files_at(path: Path) -> dict[str, Path]:
     Hidden files are left out: a file that is being written is hidden until it is whole.
     """
     if not path.exists():
-        raise FileNotFoundError(f"there is no {path}")
+        raise FileNotFoundError(f"{path} does not exist: name a log, or a folder of logs")
     known = (*FILES, *HDF5)
     if path.is_file():
         if path.suffix not in known:

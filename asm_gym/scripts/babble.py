@@ -92,7 +92,7 @@ class Args(Options):
     """Number of processes."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
-    tasks: tuple[str, ...] | None = option(None)
+    tasks: tuple[str, ...] | None = option(None, metavar="TASK ...")
     """Tasks to babble in; by default seven with the Panda, and with other arms those that their experts solve."""
     false_alarms_per_hour: float = option(5.0, quick=120.0, check=check_per_hour)
     """Promised false alarms per hour."""

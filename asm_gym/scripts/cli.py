@@ -20,12 +20,14 @@ COMMANDS = {
     "babble": "learn a memory of a body, for any policy",
     "evaluate": "compare monitors on tasks and faults",
     "watch": "watch a log or live rows with a memory",
+    "limits": "print what healthy motion needs, as the robot's own settings",
     "train": "train an agent: cloned from an expert, then improved by SAC",
     "warmup": "compile once, so that the first guarded step does not wait",
     "doctor": "check this machine, and print what to install",
     "corpus": "record the episodes behind the detection tables",
     "reproduce": "run the studies behind the method's claims",
     "benchmark": "measure speeds as ratios against named rivals",
+    "completion": "print what lets bash or zsh complete commands and options",
 }
 
 MODULES = {"inspect": "inspect_log"}  # modules with another name than their command

@@ -32,7 +32,7 @@ class Args(Options):
     """Name of a task, or any Gymnasium id with numeric spaces, such as Pusher-v5."""
     policy: str = "scripted"
     """Policy: scripted, hold, sway, a shipped agent, or the path of an agent."""
-    robot: str | None = option(None, known=ROBOTS)
+    robot: str | None = option(None, known=ROBOTS, metavar="NAME")
     """The arm; by default that of the task."""
     episodes: int = option(100, quick=4, least=1)
     """Number of episodes; a second call with a larger number continues."""

@@ -188,7 +188,7 @@ def _hint(about: Any) -> Callable[[str], str]:
             parts.append(f"known: {listed}")
         if default == "(required)":
             parts.append("required")
-        elif default not in ("", "None", "True", "False"):
+        elif default not in ("", "''", "None", "True", "False"):
             parts.append(f"default: {default}")
         quick = about.get("quick", _NO_QUICK_VALUE)
         if isinstance(quick, tuple):

@@ -61,7 +61,9 @@ class Args(Options):
     """The arm, for robosuite's tasks."""
     policy: str = "scripted"
     """Policy: scripted, sway, or the path of an agent."""
-    steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
+    steps: int | None = option(
+        None, check=partial(check_number, "steps", low=2, whole=True), metavar="N"
+    )
     """Length of an episode of an environment given by its id; by default its own."""
     monitors: tuple[str, ...] = option(
         tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name

@@ -44,6 +44,7 @@ from asm_gym.validation import check_number
 SILENCE_S = 2.0  # a live source without a row for this long has ended [s]
 PIECE_S = 5.0  # longest pieces of a live recording [s]
 SPARE_PIECES = 4  # pieces of a live recording beyond what the promise needs
+FEWEST_WITHOUT_RATE = 4  # calibration episodes where no rate is asked for: one false alarm in 5
 FEWEST_CALIBRATION = 1  # calibration episodes for a promise by the hour, which needs hours instead
 CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are not learned from
 QUICK_EPISODES = 20  # most episodes with ``--quick``
@@ -63,8 +64,9 @@ class Args(LogOptions):
     """File to write the memory to."""
     monitor: str = option("neural_asm", check=check_monitor_name, known=MONITORS)
     """Name of the monitor."""
-    false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
-    """Share of normal episodes that may raise an alarm, in (0, 1)."""
+    false_alarm_rate: float | None = option(None, check=conformal_episodes, metavar="SHARE")
+    """Share of normal episodes that may raise an alarm, in (0, 1); by default 0.05, or what fewer than 38 can
+    promise."""
     false_alarms_per_hour: float | None = option(None, metavar="X")
     """Alarms per hour of normal motion, in place of --false-alarm-rate."""
     action: tuple[str, ...] = option((), metavar="COLUMN")
@@ -98,7 +100,7 @@ class Args(LogOptions):
     def promise(self) -> AlarmRate:
         """The promise of the threshold."""
         if self.false_alarms_per_hour is None:
-            return AlarmRate.of(self.false_alarm_rate, None)
+            return AlarmRate.of(self.false_alarm_rate or FALSE_ALARM_RATE, None)
         return AlarmRate.of(None, self.false_alarms_per_hour)
 
     @property
@@ -106,7 +108,21 @@ class Args(LogOptions):
         """Calibration episodes that the promise takes; 0 for one by the hour."""
         if self.promise.per != EPISODE:
             return 0
-        return conformal_episodes(self.false_alarm_rate)
+        return conformal_episodes(self.promise.rate)
+
+    @property
+    def fewest(self) -> int:
+        """Calibration episodes below which it refuses: a rate that was not asked for may be higher than the default."""
+        if self.false_alarm_rate is None:
+            return min(self.needed, FEWEST_WITHOUT_RATE)
+        return self.needed
+
+    def promising(self, calibration_episodes: int) -> Args:
+        """Return options with the least rate that so many episodes can promise, where none was asked for."""
+        if self.promise.per != EPISODE or self.false_alarm_rate is not None:
+            return self
+        possible = 1.0 / (calibration_episodes + 1)
+        return replace(self, false_alarm_rate=max(FALSE_ALARM_RATE, possible))
 
 
 def record_live(args: Args, say: Callable[[str], None]) -> Args:
@@ -142,14 +158,14 @@ def divide(
     by_hour = args.promise.per != EPISODE
     if is_live or (by_hour and args.split is not None):
         fitting, calibration = training_selection.split_in_time(stretches, CALIBRATION_SHARE)
-        if len(calibration) < args.needed:
+        if len(calibration) < args.fewest:
             raise ValueError(
-                f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to "
+                f"a false-alarm rate of {args.promise.rate:g} needs {args.needed} pieces to "
                 f"calibrate on, got {len(calibration)} of {args.split:g} s: record for longer, or "
                 "take a higher --false-alarm-rate"
             )
     else:
-        needed = args.needed or FEWEST_CALIBRATION
+        needed = args.fewest or FEWEST_CALIBRATION
         fitting, calibration = training_selection.split_at_random(
             flat(stretches), needed, CALIBRATION_SHARE, args.seed
         )
@@ -328,6 +344,7 @@ def fit(args: Args, console: Console) -> int:
     if repeats:
         notes_on_parts.append(f"Left out: {repeats} parts whose rows are those of another one.")
     fitting, calibration = divide(args, stretches, is_live)
+    args = args.promising(len(calibration))
 
     spec = fitting[0].spec
     with stage("learning", console) as progress:
@@ -362,12 +379,19 @@ def summary_of_threshold(args: Args, monitor: Any, calibration_episodes: int) ->
     used = len(monitor.maxima_)
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     if args.promise.per == EPISODE:
-        promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
+        promise = f"an alarm in at most {args.promise.rate:.1%} of normal ones"
     if monitor.promise.modelled:
         promise += ", by a model of the tail of their maxima, as they are few"
     if used < calibration_episodes:
         promise += f"; {calibration_episodes - used} more say how far each sense goes"
     yield f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}."
+
+    if args.promise.per == EPISODE and args.promise.rate > FALSE_ALARM_RATE:
+        usual = conformal_episodes(FALSE_ALARM_RATE) + 1
+        yield (
+            f"So few episodes promise at most one false alarm in {1 / args.promise.rate:.3g}; "
+            f"{(usual - 1) / CALIBRATION_SHARE:g} promise one in {usual}."
+        )
 
     expected, at_most = monitor.promise.hourly(hours)
     line = (

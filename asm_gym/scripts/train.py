@@ -37,7 +37,7 @@ class Args(Options):
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with Box spaces."""
-    robot: str | None = option(None, known=ROBOTS)
+    robot: str | None = option(None, known=ROBOTS, metavar="NAME")
     """The arm; by default that of the task."""
     steps: int = option(20_000, quick=300, least=0)
     """Control steps of SAC; 0 for a clone."""
