@@ -16,7 +16,7 @@ from asm_gym.detection.healthy_ranges import LEAD, healthy_ranges, share_beyond
 from asm_gym.exceptions import LimitsLacking, NotFitted
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.limit_formats import FORMATS
-from asm_gym.monitors.robot_limits import EXTERNAL_TORQUE, POSITION, TARGET_DISTANCE, kind_of
+from asm_gym.monitors.robot_limits import EXTERNAL_TORQUE, NEAR, POSITION, TARGET_DISTANCE, kind_of
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -65,7 +65,9 @@ def test_a_healthy_hour_stays_within_the_limits_and_a_hard_push_does_not(monitor
     assert (hour[:, :8] >= low).all()
     assert (hour[:, :8] <= high).all()
     assert limits.of(EXTERNAL_TORQUE)[0].high < 10.0
-    assert all(0.0 <= limit.near < 0.05 for limit in limits.of(EXTERNAL_TORQUE))
+    loads = np.abs(np.concatenate([healthy(n).stream for n in range(10, 40)])[:, 4])
+    near = np.mean(loads > NEAR * limits.of(EXTERNAL_TORQUE)[0].high)
+    assert limits.of(EXTERNAL_TORQUE)[0].near == pytest.approx(near, abs=0.02)
     assert limits.of(POSITION)[1].high <= 1.0  # its stop
 
 
