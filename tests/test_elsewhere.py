@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import NormalizeObservation
 
 from asm_gym import collect, register_task
+from asm_gym.data.known_environments import known_means
 from asm_gym.data.minari_datasets import read_dataset
 from asm_gym.faults import (
     ActionDelay,
@@ -28,6 +31,7 @@ from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec, flat, flat_rows
 from asm_gym.tasks import OWN
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
+from asm_gym.wrappers.capabilities import missing_meaning
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
 
@@ -103,6 +107,48 @@ def test_discrete_actions_are_recorded_watched_and_never_taken_over():
     assert ended.step(0)[2]
     with pytest.raises(TypeError, match=r"needs a Box action space.*on_alarm=\"monitor\""):
         NeuralASMSafety(Both(), CueMonitor([2], recorder.stream_spec))
+
+
+class Renamed(FakeEnv):
+    """An environment that does not say what its actions mean."""
+
+    def __init__(self, env_id):
+        super().__init__()
+        self.action_means = None
+        self.spec = SimpleNamespace(id=env_id)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "means"),
+    [
+        ("FetchReachDense-v4", ("delta",) * 3),
+        ("FrankaKitchen-v1", ("velocity",) * 3),
+        ("panda_gym:PandaReachJoints-v3", ("delta",) * 3),
+        ("Meta-World/MT1", ("delta",) * 3),
+        ("HandReach-v2", ("target",) * 3),
+        ("dm_control/manipulator-bring_ball-v0", ("torque",) * 3),
+        ("Pendulum-v1", None),
+    ],
+)
+def test_actions_of_known_environments_need_no_declaration(env_id, means):
+    assert known_means(env_id, 3) == means
+    env = Renamed(env_id)
+    assert (missing_meaning(env) == "") == (means is not None)
+    refused = means is None or "torque" in means
+    if refused:
+        with pytest.raises(ValueError, match="action_means"):
+            NeuralASMSafety(env, CueMonitor([1]), on_alarm="hold")
+    else:
+        NeuralASMSafety(env, CueMonitor([1]), on_alarm="hold").reset(seed=0)
+
+
+def test_a_kept_number_of_a_known_action_stays_as_it_was_executed():
+    assert known_means("Meta-World/MT1", 4) == ("delta", "delta", "delta", "kept")
+
+
+def test_collect_asks_for_the_meaning_of_actions_that_are_not_known():
+    with pytest.warns(UserWarning, match="action_means"):
+        collect("Pendulum-v1", "sway", episodes=1, workers=1)
 
 
 def test_spaces_that_are_no_numbers_cannot_be_a_stream():

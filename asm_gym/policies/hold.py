@@ -22,7 +22,8 @@ from gymnasium.vector import VectorActionWrapper, VectorEnv
 from gymnasium.wrappers import ClipAction, TransformAction
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import DELTA, TARGET, VELOCITY, ActionMeaning
+from asm_gym.data.action_meaning import DELTA, KEPT, TARGET, VELOCITY, ActionMeaning
+from asm_gym.data.known_environments import known_means
 from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.stream_source import layers
 
@@ -190,17 +191,16 @@ def staying(
 
     if recorded is not None:
         _warn_of_contradictions(declared, recorded)
-    has_target = TARGET in declared.means
-    if not has_target and not isinstance(env, VectorEnv):
+    follows_rows = np.isin(declared.means, (TARGET, KEPT))
+    if not follows_rows.any() and not isinstance(env, VectorEnv):
         return Staying(resting_action(env))
 
     changed = why_changed(env, "a reflex")
     if changed:
         raise UnsupportedEnvironment(changed)
-    is_no_target = np.array(declared.means) != TARGET
-    if np.any(zero.ravel()[is_no_target]):  # the space does not contain zero
+    if np.any(zero.ravel()[~follows_rows]):  # the space does not contain zero
         raise UnsupportedEnvironment(_no_rest(space))
-    if has_target:
+    if follows_rows.any():
         return Staying(zero, declared)
     return Staying(zero)
 
@@ -218,7 +218,7 @@ def _warn_of_contradictions(declared: ActionMeaning, recorded: ActionMeaning) ->
 
 
 def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
-    """Return the resting action of an environment with the attribute ``action_means``.
+    """Return the resting action of an environment with the attribute ``action_means``, or with a known id.
 
     Raises:
         UnsupportedEnvironment: the attribute does not say that a zero action makes the robot stay.
@@ -228,6 +228,9 @@ def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
         means = env.get_wrapper_attr("action_means") or ()
     if isinstance(means, str):
         means = (means,)
+    if not means:
+        env_id = getattr(env.unwrapped.spec, "id", "")
+        means = known_means(env_id, int(np.prod(env.action_space.shape or ())))
     if not means or not set(means) <= {DELTA, VELOCITY}:
         raise UnsupportedEnvironment(
             f'{env.unwrapped} has no action_means="delta" or "velocity", '

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -40,8 +41,12 @@ from asm_gym.rollouts.trial import PASSING, PolicySource, RolloutConfig, Setting
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
+from asm_gym.wrappers.capabilities import missing_meaning
 from asm_gym.wrappers.faults import FaultInjection
 
+OWN_IDS = (
+    "asm_gym/"  # begins the ids of environments that hold by themselves or say what actions mean
+)
 UNUSED_STAGE = 99  # stage of the random draws whose seeds no recorded episode has
 
 
@@ -249,8 +254,18 @@ def collect(
     """
     check_number("episodes", episodes, low=1, whole=True)
     config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))
+    unknown = unknown_actions(env_id, config)
+    if unknown:
+        warnings.warn(unknown, stacklevel=3)
     task = partial(record_episode, spec=env_spec(env_id), config=config)
     return parallel_map(task, episode_seeds(seed, episodes, stage), workers, progress)
+
+
+def unknown_actions(env_id: str, config: RolloutConfig) -> str:
+    """Return what to say of the actions of a foreign environment before episodes are spent; empty for nothing."""
+    if env_id.startswith(OWN_IDS):
+        return ""
+    return missing_meaning(environment(env_id, config.settings))
 
 
 def record_episode(seed: int, spec: EnvSpec, config: RolloutConfig) -> Episode:

@@ -17,7 +17,7 @@ from asm_gym.data.episode import load_episode
 from asm_gym.data.minari_datasets import require_minari, write_dataset
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
-from asm_gym.rollouts.run_trials import check_config, collect_to
+from asm_gym.rollouts.run_trials import check_config, collect_to, unknown_actions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, task_in
 from asm_gym.scripts.command import Options, option, run
@@ -59,6 +59,9 @@ def collect(args: Args, console: Console) -> None:
     settings = dict(config.settings)
     name = dataset_id(args.task, args.policy)
     check_config(task, config)
+    unknown = unknown_actions(task, config)
+    if unknown:
+        console.print(f"Note: {unknown}.", soft_wrap=True, markup=False)
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
         with stage("recording", console) as progress:

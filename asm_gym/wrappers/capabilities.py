@@ -6,11 +6,15 @@ vector environment are of one kind; they have a capability if all of them have i
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeaning, ActionMeans
+from asm_gym.data.known_environments import known_means
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.kinematics import Chain
 from asm_gym.guard.robot_facts import RobotFacts, TurningAction
@@ -142,7 +146,7 @@ def declared_meaning(
     recorded: ActionMeaning | None,
     action_means: ActionMeans | None,
 ) -> ActionMeaning | None:
-    """Return what actions mean, as declared: ``action_means``; None without it.
+    """Return what actions mean: ``action_means``, or what is known of the environment's id; None without either.
 
     Args:
         attributes: of the environment.
@@ -155,9 +159,33 @@ def declared_meaning(
     """
     if action_means is None:
         action_means = attributes.first("action_means")
-    if action_means is None:
+    if action_means is not None:
+        return ActionMeaning.declared(action_means, size, recorded)
+
+    spec = attributes.first("spec")
+    known = known_means(getattr(spec, "id", ""), size)
+    if known is None:
         return None
-    return ActionMeaning.declared(action_means, size, recorded)
+    return replace(recorded or ActionMeaning.unknown((size,)), means=known)
+
+
+def missing_meaning(env: gym.Env[Any, Any]) -> str:
+    """Return that nothing tells what the actions of an environment mean, and how to say it; empty where it is known.
+
+    Recorded episodes may show it, but random or still ones do not.
+    """
+    attributes = EnvAttributes(env)
+    space = attributes.action_space
+    if not isinstance(space, gym.spaces.Box) or attributes.has("holding"):
+        return ""
+    size = int(np.prod(space.shape))
+    if declared_meaning(attributes, size, None, None) is not None:
+        return ""
+    return (
+        f"what the actions of {env.unwrapped} mean is not known, so hold may be refused: "
+        'set its attribute action_means, or NeuralASMSafety(..., action_means=...), to "delta", '
+        '"target", "velocity" or "torque", one for all numbers or one for each'
+    )
 
 
 def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
