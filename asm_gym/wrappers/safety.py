@@ -152,6 +152,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._ended = False
         self._executed = np.zeros(0, np.float32)
         info["overridden"] = bool(info.get("overridden"))
+        if "success" in info:
+            info.setdefault("is_success", bool(info["success"]))
         self.report_step([report], info)
         return observation, info
 
