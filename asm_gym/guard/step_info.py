@@ -230,8 +230,12 @@ class LazyInfo(dict[str, Any]):
             dict.update(self, {**make(), **dict.copy(self)})
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.bytes_]:
-        """Return its content as JSON, one text: so Minari writes it with ``record_infos=True``."""
-        return np.array(json.dumps(self, default=_plain), np.bytes_)
+        """Return its ``str`` as one text: so Minari writes it with ``record_infos=True``."""
+        return np.array(str(self), np.bytes_)
+
+    def __str__(self) -> str:
+        """Return its content as JSON."""
+        return json.dumps(dict(self), default=_plain)
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         return dict, (dict(self),)
