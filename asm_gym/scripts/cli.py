@@ -30,7 +30,10 @@ COMMANDS = {
     "completion": "print what lets bash or zsh complete commands and options",
 }
 
-MODULES = {"inspect": "inspect_log"}  # modules with another name than their command
+MODULES = {
+    "inspect": "inspect_log",
+    "completion": "shell_completion",
+}  # modules with another name than their command
 
 
 def usage(prog: str, lines: dict[str, str], *notes: str) -> str:
