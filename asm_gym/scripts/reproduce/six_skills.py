@@ -4,7 +4,8 @@ Every task is seen by the same senses: the body, torques and the wrist, where th
 from the thing. Two networks of the package, ``recurrent`` and ``settling``, are never told the skill. Each commands the
 arm in closed loop, is surprised by the energy of its own errors (``closed_loop``), leaves out a group of senses that
 alone is over its ceiling, and yields where several are. Beside them, on the same episodes: a GRU and an LSTM by
-backpropagation through time, the motor association that acts today, and a random forest for names.
+backpropagation through time, the motor association that acts today, a random forest for names, and two movement
+primitives (``skill_envelope``) for surprise and action.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from asm_gym.scripts.reproduce.closed_loop import (
     Rollout,
     run_policy,
 )
+from asm_gym.scripts.reproduce.group_energy import SurprisedModel
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.skill_claims import (
     ACTS,
@@ -44,7 +46,14 @@ from asm_gym.scripts.reproduce.skill_claims import (
     drawn,
     tables,
 )
-from asm_gym.scripts.reproduce.skill_measures import TWINS, Repetition, detect, name_skills, predict
+from asm_gym.scripts.reproduce.skill_measures import Repetition, name_skills, predict
+from asm_gym.scripts.reproduce.skill_surprise import (
+    PROMP,
+    TWINS,
+    ablated,
+    detect,
+    learn_primitives,
+)
 from asm_gym.scripts.reproduce.workspace import (
     EVENT,
     FAULTS,
@@ -58,6 +67,14 @@ from asm_gym.scripts.reproduce.workspace import (
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 
 HELD_OUT = 1000  # seeds of faulty episodes and of their twins begin here
+PARTS = {
+    "prediction": "next rows, missing senses, and the hand from memory",
+    "names": "names of skills",
+    "surprise": "energy of the networks",
+    "primitives": "surprise and closed loop of movement primitives",
+    "ablations": "energy without its parts",
+    "action": "closed loop of the networks and their rivals",
+}
 
 
 @dataclass(frozen=True)
@@ -78,6 +95,8 @@ class Config(kit.Config):
     """Times that each skill is expressed."""
     steps: int = option(LONGEST, quick=45, least=1)
     """Rows after which an expression is left."""
+    parts: tuple[str, ...] = option(tuple(PARTS), least=1, known=PARTS)
+    """Parts of the study to run; the claims need all."""
     film: bool = False
     """Also film the first seed: skills that change without notice, a push, and a sense that is lost."""
 
@@ -99,6 +118,8 @@ def run(config: Config) -> Findings:
     repetitions = kit.each("learning and acting", work, config.repetitions, config)
     records = [record for own, _ in repetitions for record in own]
     frame = pd.DataFrame(records)
+    if set(config.parts) < set(PARTS):
+        return Findings(records, tables(frame))
     _, energies = repetitions[0]
     return Findings(records, [*claims(frame), *tables(frame)], drawn(frame, energies))
 
@@ -128,16 +149,35 @@ def one_seed(
     torch.set_num_threads(1)
     repetition = Repetition(seed, config, files)
     repetition.learn()
-    predict(repetition)
-    name_skills(repetition)
-    detect(repetition)
-    actors: dict[str, Actor] = dict(repetition.networks)
-    for cell, model in repetition.rivals.items():
-        actors[cell] = Cell(model)
-    actors[ACTS] = Associated(repetition.reader, repetition.train, repetition.rng)
+    parts = config.parts
+    if "prediction" in parts or "action" in parts:
+        repetition.learn_rivals()
+    if "prediction" in parts:
+        predict(repetition)
+    if "names" in parts:
+        name_skills(repetition)
+    surprised: dict[str, SurprisedModel] = {}
+    actors: dict[str, Actor] = {}
+    if "surprise" in parts:
+        surprised |= repetition.networks
+    if "primitives" in parts:
+        primitives = learn_primitives(repetition)
+        surprised |= primitives
+        actors[PROMP] = primitives[PROMP]
+        actors[f"{PROMP}, from the first row alone"] = primitives[PROMP].after(1)
+    if "ablations" in parts:
+        surprised |= ablated(repetition)
+    if surprised:
+        detect(repetition, surprised)
+    networks = {}
+    if "action" in parts:
+        networks = repetition.networks
+        actors |= networks
+        actors |= {cell: Cell(model) for cell, model in repetition.rivals.items()}
+        actors[ACTS] = Associated(repetition.reader, repetition.train, repetition.rng)
     if config.film and seed == config.seed:
         film(repetition.networks[RECURRENT], config.out / "panda.gif", seed)
-    return repetition.records, act(repetition, actors)
+    return repetition.records, act(repetition, actors, networks)
 
 
 # ------------------------------------------------------------------ action
@@ -153,8 +193,15 @@ def scene_of(seed: int, trial: int = 0) -> int:
     return 10_000 + 100 * seed + trial
 
 
-def act(repetition: Repetition, actors: dict[str, Actor]) -> dict[str, Floats]:
+def act(
+    repetition: Repetition, actors: dict[str, Actor], networks: dict[str, LocalNetwork]
+) -> dict[str, Floats]:
     """Measure the share solved in closed loop.
+
+    Args:
+        repetition: of the study.
+        actors: act in each scene.
+        networks: also act where something happens.
 
     Returns:
         The largest energy of a group over time (T,) in the first rollout of each actor that has energies.
@@ -166,7 +213,7 @@ def act(repetition: Repetition, actors: dict[str, Actor]) -> dict[str, Floats]:
         conditions = Conditions(scene_of(repetition.seed, trial), steps=repetition.config.steps)
         env = environment(skill)
         rollouts = {name: run_policy(actor, env, conditions) for name, actor in actors.items()}
-        for name, network in repetition.networks.items():
+        for name, network in networks.items():
             own = rollouts_of(skill, network, push, conditions)
             rollouts |= {f"{name}, {condition}": rollout for condition, rollout in own.items()}
             stuck = own[f"{STUCK}, reacts"]

@@ -1,8 +1,4 @@
-"""One seed of the study of six skills: learn the networks; measure how they predict, name skills, and detect faults.
-
-An observer who knows a faulty episode and its healthy twin sees the fault where the difference d of their rows exceeds
-the noise σ of the senses: S = Σ (d/σ)² over the second after the onset is 25 or more (Van Trees 1968, section 2.2).
-"""
+"""One seed of the study of six skills: learn the networks; measure how they predict and name skills."""
 
 from __future__ import annotations
 
@@ -18,7 +14,6 @@ from scipy.signal import lfilter
 from sklearn.ensemble import RandomForestClassifier
 
 from asm_gym.data.episode import Episode, load_episode
-from asm_gym.evaluation.statistics import auroc
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.readout import KEPT, certainty, learn_readout
 from asm_gym.memory.recurrent import learn_recurrent
@@ -37,25 +32,22 @@ from asm_gym.scripts.reproduce.expression import (
 )
 from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.scripts.reproduce.skill_claims import (
-    ALARMS,
     FEW,
     FOREST,
     MANY,
     RECURRENT,
     ROWS,
-    SEEN,
     SETTLING,
 )
+from asm_gym.scripts.reproduce.skill_surprise import set_ceiling
 from asm_gym.scripts.reproduce.workspace import (
     EVENT,
-    FAULTS,
     GROUP_OF,
     GROUPS,
     HAND,
     SECOND,
     SKILLS,
     SPEC,
-    UNKNOWN,
     Floats,
 )
 
@@ -109,14 +101,8 @@ LOCAL = {
 }
 CELL_UNITS = {"GRU": 164, "LSTM": 139}
 FELT = ("torque", "wrench")  # groups that reach no unit of the recurrent network
-TWINS = "twins"  # healthy episodes of the same seeds as the faulty ones
-RATE = 0.05  # share of healthy episodes over a ceiling
-WARM = 3  # first rows, which are not judged
 BEFORE_CHANGE = 40  # rows of another skill before the one that is to be named
 HIDDEN_SHARE = 0.3  # of the rows, in which a group of senses is missing
-VISIBLE = 25.0  # S from which an observer who knows the twin sees a fault
-COARSEST = {"object": 0.005, "joint": 2e-4, "hand": 5e-4, "gripper": 2e-4}
-"""Noise of senses whose channels declare none or less, by group."""
 UNSEEN = -9.0  # what the forest reads for a sense that is left out
 ALIKE = ("PickPlaceCan", "PickPlaceMilk")
 
@@ -136,6 +122,8 @@ class Repetition:
         self.files = files
         self.rng = np.random.default_rng(seed)
         self.records: list[Record] = []
+        self.networks: dict[str, LocalNetwork] = {}
+        self.rivals: dict[str, Backpropagated] = {}
         self.train: list[Episode] = []
         self.tests: list[Episode] = []
         self.calibration: list[Episode] = []  # they set the ceilings
@@ -148,10 +136,9 @@ class Repetition:
             self.tests += shuffled[-sixth:]
 
     def learn(self) -> None:
-        """Train the networks and their rivals."""
+        """Train the networks."""
         self.reader = fit_reader(self.train)
         taught = trajectories(self.reader, self.train)
-        self.networks: dict[str, LocalNetwork] = {}
         for name, settings in LOCAL.items():
             schedule = settings.schedule._replace(epochs=self.config.epochs)
             start = time.process_time()
@@ -161,10 +148,11 @@ class Repetition:
             trained = learn(taught, settings.hidden, schedule, self.rng, lambda: None)
             self.note("time to learn [s]", name, "one core", time.process_time() - start)
             local = LocalNetwork(self.reader, trained.network, self.train)
-            highest = largest_energies(local, self.calibration, slice(WARM, None))
-            local.ceiling = float(np.quantile(highest, 1.0 - RATE))
+            set_ceiling(local, self.calibration)
             self.networks[name] = local
-        self.rivals: dict[str, Backpropagated] = {}
+
+    def learn_rivals(self) -> None:
+        """Train the rivals that learn through time."""
         for cell, hidden in CELL_UNITS.items():
             training = Training(cell, hidden, self.config.updates)
             start = time.process_time()
@@ -406,51 +394,3 @@ def rows_until(right: NDArray[np.bool_]) -> int:
     """Return after how many rows it is right for good."""
     wrong = np.flatnonzero(~right)
     return int(wrong[-1]) + 2 if len(wrong) else 1
-
-
-# ------------------------------------------------------------------ surprise
-
-
-def largest_energies(local: LocalNetwork, episodes: Sequence[Episode], rows: slice) -> Floats:
-    """Return the largest energy of any group in some rows of each episode (N,) [ceiling]."""
-    readings = [local.read_stream(e.stream) for e in episodes]
-    return np.array([reading.energy[rows].max() for reading in readings])
-
-
-def detect(repetition: Repetition) -> None:
-    """Measure how well energy tells each kind of fault from its twins, and unknown skills from known ones."""
-    whole = slice(WARM, None)
-    around = slice(EVENT, EVENT + SECOND)
-    healthy = repetition.tests
-    twins = repetition.load(TWINS)
-    conditions = [(kind, around, twins) for kind in FAULTS]
-    conditions += [(skill, whole, healthy) for skill in UNKNOWN]
-    for name, local in repetition.networks.items():
-        usual = largest_energies(local, healthy, whole)
-        repetition.note(ALARMS, name, "healthy", np.mean(usual > 1.0))
-        for at, rows, compared in conditions:
-            episodes = repetition.load(at)
-            energies = largest_energies(local, episodes, rows)
-            of_compared = largest_energies(local, compared, rows)
-            repetition.note("AUROC", name, at, auroc(energies, of_compared))
-            repetition.note(ALARMS, name, at, np.mean(energies > 1.0))
-            if at in FAULTS:
-                seen = is_visible(episodes, twins)
-                repetition.note("share visible", "ideal observer", at, seen.mean())
-                if seen.any():
-                    repetition.note(SEEN, name, at, auroc(energies[seen], of_compared))
-
-
-def is_visible(episodes: Sequence[Episode], twins: Sequence[Episode]) -> NDArray[np.bool_]:
-    """Return whether an observer who knows its twin sees the fault of each episode (N,)."""
-    floor = np.array([COARSEST.get(group, 0.1) for group in GROUP_OF])
-    noise = np.maximum(SPEC.noise, floor)
-    twin_of = {(twin.info["skill"], twin.seed): twin for twin in twins}
-    visible = []
-    for episode in episodes:
-        twin = twin_of[episode.info["skill"], episode.seed]
-        end = min(len(episode), len(twin), EVENT + SECOND)
-        difference = episode.stream[EVENT:end].astype(np.float64) - twin.stream[EVENT:end]
-        difference[:, SPEC.motor] = 0.0  # commands answer to the fault
-        visible.append(np.sum((difference / noise) ** 2) >= VISIBLE)
-    return np.array(visible)
