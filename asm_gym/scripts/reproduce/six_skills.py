@@ -46,6 +46,7 @@ from asm_gym.scripts.reproduce.skill_claims import (
     drawn,
     tables,
 )
+from asm_gym.scripts.reproduce.skill_envelope import SkillEnvelope
 from asm_gym.scripts.reproduce.skill_measures import Repetition, name_skills, predict
 from asm_gym.scripts.reproduce.skill_surprise import (
     PROMP,
@@ -150,34 +151,42 @@ def one_seed(
     repetition = Repetition(seed, config, files)
     repetition.learn()
     parts = config.parts
-    if "prediction" in parts or "action" in parts:
+    if not {"prediction", "action"}.isdisjoint(parts):
         repetition.learn_rivals()
     if "prediction" in parts:
         predict(repetition)
     if "names" in parts:
         name_skills(repetition)
-    surprised: dict[str, SurprisedModel] = {}
-    actors: dict[str, Actor] = {}
-    if "surprise" in parts:
-        surprised |= repetition.networks
+    primitives: dict[str, SkillEnvelope] = {}
     if "primitives" in parts:
         primitives = learn_primitives(repetition)
-        surprised |= primitives
-        actors[PROMP] = primitives[PROMP]
-        actors[f"{PROMP}, from the first row alone"] = primitives[PROMP].after(1)
-    if "ablations" in parts:
-        surprised |= ablated(repetition)
-    if surprised:
-        detect(repetition, surprised)
-    networks = {}
+    measure_surprise(repetition, primitives)
+    if config.film and seed == config.seed:
+        film(repetition.networks[RECURRENT], config.out / "panda.gif", seed)
+    actors: dict[str, Actor] = {}
+    networks: dict[str, LocalNetwork] = {}
     if "action" in parts:
         networks = repetition.networks
         actors |= networks
         actors |= {cell: Cell(model) for cell, model in repetition.rivals.items()}
         actors[ACTS] = Associated(repetition.reader, repetition.train, repetition.rng)
-    if config.film and seed == config.seed:
-        film(repetition.networks[RECURRENT], config.out / "panda.gif", seed)
+    if primitives:
+        actors[PROMP] = primitives[PROMP]
+        actors[f"{PROMP}, from the first row alone"] = primitives[PROMP].after(1)
     return repetition.records, act(repetition, actors, networks)
+
+
+def measure_surprise(repetition: Repetition, primitives: dict[str, SkillEnvelope]) -> None:
+    """Measure the surprise of all that the wanted parts of the study name."""
+    parts = repetition.config.parts
+    models: dict[str, SurprisedModel] = {}
+    if "surprise" in parts:
+        models |= repetition.networks
+    models |= primitives
+    if "ablations" in parts:
+        models |= ablated(repetition)
+    if models:
+        detect(repetition, models)
 
 
 # ------------------------------------------------------------------ action
