@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.readings import resolution
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import CARRIED_CHANNEL, HANDLED, StreamSpec
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -33,6 +33,10 @@ SLOW = 0.3  # a channel is slow where a step's change is under this share of its
 LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
 FEWEST_VALUES = 5  # a channel of fewer different values is a flag or a mode
 RESOLUTION_ROWS = 10_000  # about so many rows tell the resolution of each channel
+
+# Precision of what a handled object does where it may begin to move with the hand, or stop: as that
+# of a row at a knock (``detection.benign_events``).
+EXPECTED = 0.1
 
 # Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted
 # from such a number.
@@ -48,6 +52,7 @@ class ScaledRows(NamedTuple):
     inputs: NDArray[np.float32]  # (B, I) of association; 0 where unseen or cut off
     changes: NDArray[np.float32]  # (B, X) what is judged; 0 where unseen
     whole: NDArray[np.float32]  # (B, 1) 1 where nothing was unseen in any of the three rows, else 0
+    precision: NDArray[np.float32]  # (B, X) of changes, by what they happen in; see ``expectation``
     finite: NDArray[np.bool_]  # (B, D)
 
 
@@ -58,8 +63,9 @@ class RowScale(NamedTuple):
     spread: Floats  # (D,) their standard deviation
     change: Floats  # (D,) standard deviation of the change over ``lag`` rows
     sensory: Ints  # (X,) columns that are sensed
-    motor: Ints  # (A,) columns that are commanded
+    commanded: Ints  # (A,) columns that are commanded
     slow: Ints  # (S - X,) columns whose change is sensed too
+    carried: Ints  # (D,) column that says how the object of a column moves; -1 for other columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +104,7 @@ class StreamScaler:
     def slow(self) -> NDArray[np.intp]:
         """(S - X,) columns of the stream whose change is sensed too."""
         slow = self.change < SLOW * self.spread
-        slow[self.spec.motor] = False
+        slow[self.spec.commanded] = False
         return np.flatnonzero(slow)
 
     @cached_property
@@ -109,8 +115,9 @@ class StreamScaler:
             spread=np.array(self.spread, np.float64),
             change=np.array(self.change, np.float64),
             sensory=self.spec.sensory.copy(),
-            motor=self.spec.motor.copy(),
+            commanded=self.spec.commanded.copy(),
             slow=self.slow,
+            carried=carried_columns(self.spec),
         )
 
     @cached_property
@@ -136,7 +143,7 @@ class StreamScaler:
     @cached_property
     def inputs(self) -> int:
         """I, how many numbers association reads: those before, all changes, the command and a constant."""
-        return self.spec.size + self.size + len(self.spec.motor) + 1
+        return self.spec.size + self.size + len(self.spec.commanded) + 1
 
     def read_episode(self, stream: Rows) -> ScaledRows:
         """Read all rows of an episode (T, D); nothing has moved before the first ``lag``."""
@@ -153,6 +160,40 @@ class StreamScaler:
             earlier=np.ascontiguousarray(earlier, np.float64),
             scale=self.row_scale,
         )
+
+
+def carried_columns(spec: StreamSpec) -> Ints:
+    """Return for each column (D,) of the group ``HANDLED`` its column of ``CARRIED_CHANNEL``; -1 for all others."""
+    columns = np.full(spec.size, -1, np.intp)
+    for channel in spec.channels:
+        prefix = channel.name.removesuffix(CARRIED_CHANNEL)
+        if channel.group != HANDLED or prefix == channel.name:
+            continue
+        for other in spec.channels:
+            if other.group == HANDLED and other.name.startswith(prefix):
+                columns[spec.slices[other.name]] = spec.slices[channel.name].start
+    return columns
+
+
+@inner
+def expectation(number: float, before: float, earlier: float) -> float:
+    """Return the precision of what an object does, by how it moves in the last three rows.
+
+    0: no object is tracked in one of them. ``EXPECTED``: fingers moved at it, so that it may begin to move with the
+    hand, or stop. Else 1.
+    """
+    least = min(number, before, earlier)
+    if least < 0.0:
+        return 0.0
+    if is_undecided(number) or is_undecided(before) or is_undecided(earlier):
+        return EXPECTED
+    return 1.0
+
+
+@inner
+def is_undecided(carried: float) -> bool:
+    """Return whether an object neither moves with the hand nor rests."""
+    return 0.0 < carried < 1.0
 
 
 @inner
@@ -196,13 +237,14 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
     B, D = rows.shape
     X = len(scale.sensory)
     L = len(scale.slow)
-    A = len(scale.motor)
+    A = len(scale.commanded)
     senses = np.zeros((B, X + L), np.float32)
     seen = np.zeros((B, X + L), np.float32)
     commands = np.ones((B, A + 1), np.float32)
     inputs = np.ones((B, D + X + L + A + 1), np.float32)
     changes = np.zeros((B, X), np.float32)
     whole = np.ones((B, 1), np.float32)
+    precision = np.ones((B, X), np.float32)
     finite = np.zeros((B, D), np.bool_)
     for n in range(B):
         for i in range(D):
@@ -231,10 +273,36 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
             inputs[n, D + k] = _zero_if_extreme((last - earlier[n, i]) / change[i])
 
         for j in range(A):
-            i = scale.motor[j]
+            i = scale.commanded[j]
             commands[n, j] = _standardised(rows[n, i], mean[i], spread[i])
             inputs[n, D + X + L + j] = _zero_if_extreme(commands[n, j])
-    return ScaledRows(senses, seen, commands, inputs, changes, whole, finite)
+        expect_events(scale, rows[n], before[n], earlier[n], inputs[n], precision[n])
+    return ScaledRows(senses, seen, commands, inputs, changes, whole, precision, finite)
+
+
+@inner
+def expect_events(
+    scale: RowScale, row: Any, before: Any, earlier: Any, inputs: Any, precision: Any
+) -> None:
+    """Write the precision (X,) of changes of handled objects, and 0 for inputs (I,) that predict nothing.
+
+    These are all changes of an object of which nothing was known before, and of the number that says how it moves.
+    """
+    D = len(row)
+    X = len(scale.sensory)
+    for j in range(X):
+        i = scale.sensory[j]
+        c = scale.carried[i]
+        if c < 0:
+            continue
+        precision[j] = expectation(row[c], before[c], earlier[c])
+        if precision[j] == 0.0 or i == c:
+            inputs[D + j] = 0.0
+    for j in range(len(scale.slow)):
+        i = scale.slow[j]
+        c = scale.carried[i]
+        if c >= 0 and (i == c or before[c] < 0.0 or earlier[c] < 0.0):
+            inputs[D + X + j] = 0.0
 
 
 def rows_apart(dt: float) -> int:

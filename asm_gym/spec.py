@@ -21,6 +21,8 @@ from asm_gym.exceptions import DamagedFile, SpecMismatch
 from asm_gym.validation import check_number, short_repr, typed
 
 MOTOR = "action"  # the group that holds the commanded action
+HANDLED = "handled"  # the group of the object at the hand, as a tracker of poses sees it
+CARRIED_CHANNEL = "object_carried"  # its channel that says how the object moves
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class Channel:
         elements: a name for each number; by default ``0, 1, …``.
         resolution: smallest difference of two readings [unit]; 0 if unknown or computed from several sensors.
         stops: (least, most) of each joint [unit]; empty if unknown.
+        commanded: a controller has put it out, as a commanded torque or a desired current. It is a command (an
+            efference copy) as the group ``action`` is: it predicts the senses, and is not judged.
 
     Example:
         >>> from asm_gym import Channel
@@ -53,6 +57,7 @@ class Channel:
     elements: tuple[str, ...] = ()
     resolution: float = 0.0
     stops: tuple[tuple[float, float], ...] = ()
+    commanded: bool = False
 
     def __post_init__(self) -> None:
         who = f"channel {self.name!r}"
@@ -70,6 +75,11 @@ class Channel:
         for what, values in (("element names", self.elements), ("pairs of stops", self.stops)):
             if values and len(values) != self.size:
                 raise ValueError(f"{who} has size {self.size} but {len(values)} {what}")
+
+    @property
+    def is_command(self) -> bool:
+        """Whether it is a command, and not a sense."""
+        return self.commanded or self.group == MOTOR
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -117,7 +127,7 @@ class StreamSpec:
         names = [channel.name for channel in self.channels]
         if len(set(names)) != len(names):
             raise ValueError(f"channel names must be unique, got {names}")
-        if all(channel.group == MOTOR for channel in self.channels):
+        if all(channel.is_command for channel in self.channels):
             raise ValueError("a stream needs at least one channel that is not an action")
         check_number("dt", self.dt, above=0.0)
 
@@ -164,13 +174,18 @@ class StreamSpec:
 
     @cached_property
     def motor(self) -> NDArray[np.intp]:
-        """Indices of the commanded action."""
+        """Indices of the commanded action, which a policy gives."""
         return np.flatnonzero([group == MOTOR for group in self._of_each_number("group")])
+
+    @cached_property
+    def commanded(self) -> NDArray[np.intp]:
+        """Indices of all commands: the action, and what controllers put out."""
+        return np.flatnonzero(self._of_each_number("is_command"))
 
     @cached_property
     def sensory(self) -> NDArray[np.intp]:
         """Indices of everything that is sensed."""
-        return np.flatnonzero([group != MOTOR for group in self._of_each_number("group")])
+        return np.flatnonzero(np.logical_not(self._of_each_number("is_command")))
 
     def _of_each_number(self, attribute: str) -> list[Any]:
         """Return D values: an attribute of the channel that each number belongs to."""

@@ -156,6 +156,7 @@ def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
         inputs=a,
         changes=np.ascontiguousarray(a[:, :4]),
         whole=np.ones((1500, 1), np.float32),
+        precision=np.ones((1500, 4), np.float32),
         finite=np.ones(a.shape, bool),
     )
     wiring = Wiring(spans(w.U), layout.groups, layout.changes_last)

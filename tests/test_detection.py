@@ -309,6 +309,7 @@ def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> 
         steps=evidence_steps(counted[:2]),
         most=np.full(rows.shape[1], most),
         offset=np.zeros(rows.shape[1]),
+        carried=np.full(rows.shape[1], -1),
     )
     for row in rows:
         state = state.followed_by(row[None], weights)

@@ -74,7 +74,9 @@ LABEL_NAME = _word(
     "grip_?lost|y_true|ground_?truth|outliers?"
 )
 COMMAND_NAME = _word(
-    "target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?"
+    "target|desired|des|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?|"
+    "control_output|"  # of UR's joints
+    "(d?tau_J|tau|d{0,2}q|elbow|O_T_EE|O_dP_EE)_d"  # of Franka's libfranka
 )
 _SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
 _PLACES = "pos|position|positions|angles?|q|qpos|joint_pos"

@@ -32,6 +32,7 @@ from asm_gym.detection.repetition import (
     evidence_steps,
     pool_repetitions,
 )
+from asm_gym.scaling import carried_columns
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
 
@@ -159,6 +160,7 @@ class EvidenceDetection:
             steps=evidence_steps(counted[:2]),
             most=offset + MOST_BEYOND,
             offset=offset,
+            carried=carried_columns(self.spec)[self.spec.sensory],
         )
 
     @property

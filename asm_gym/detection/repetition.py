@@ -47,6 +47,8 @@ class RepetitionWeights(NamedTuple):
     steps: Floats  # (2, 2, X) see ``evidence_steps``
     most: Floats  # (X,) upper bound of n
     offset: Floats  # (X,) n_0
+    # (X,) column that is below 0 where there is nothing to sense, so that nothing repeats; or -1
+    carried: NDArray[np.intp]
 
 
 NO_REPETITION = RepetitionWeights(
@@ -54,6 +56,7 @@ NO_REPETITION = RepetitionWeights(
     steps=np.zeros((2, 2, 0)),
     most=np.zeros(0),
     offset=np.zeros(0),
+    carried=np.zeros(0, np.intp),
 )
 """What is known of no senses."""
 
@@ -144,6 +147,7 @@ def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
         steps=evidence_steps(surprise),
         most=np.full(senses, np.inf),
         offset=offset,
+        carried=np.full(senses, -1, np.intp),
     )
     longest_first = sorted(streams, key=len, reverse=True)
     state = Repetition.start(len(streams), senses)
@@ -178,6 +182,9 @@ def step_repetition(
             column = weights.columns[i]
             reading = rows[n, column]
             again = reading == before.row[n, i]
+            carried = weights.carried[i]
+            if carried >= 0 and rows[n, carried] < 0.0:
+                again = False
             repeated = before.again[n, i]
             step = weights.steps[int(repeated), int(again), i]
             unlikely = before.unlikely[n, i] + step

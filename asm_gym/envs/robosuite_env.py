@@ -16,9 +16,10 @@ from asm_gym.envs.arms import PHYSICS_FREQ, chains_of
 from asm_gym.envs.rendering import OffscreenRenderer
 from asm_gym.envs.robots import mend_robots, robot_named, robots_for
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Senses
+from asm_gym.envs.simulated_tracker import HandledObjects
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
-from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.spec import HANDLED, MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import (
     check_choice,
@@ -178,13 +179,19 @@ class RobosuiteEnv(SteppedEnv):
         self.simulation = Simulation(self.robosuite_env, self.substeps)
         self._objects = robosuite_backend.ObjectSensors(self.robosuite_env, self.task)
         robosuite_backend.speed_up_contacts(self.robosuite_env)
+        self._tracker: HandledObjects | None = None
+        if HANDLED in self._groups:
+            self._tracker = HandledObjects(self.simulation, self.sensor_noise)
         self.simulation.keeps_history = self.task.name == "Wipe"  # whose reward reads it
 
     def _build_spaces(self) -> None:
         channels = (*self.simulation.proprioception.channels, *self._objects.channels)
         action = Channel("action", self._actions.size, group=MOTOR)
+        tracked: tuple[Channel, ...] = ()
+        if self._tracker is not None:
+            tracked = self._tracker.channels
         spec = StreamSpec(
-            channels=(*channels, action),
+            channels=(*channels, *tracked, action),
             dt=self._row_substeps / PHYSICS_FREQ,
             source="+".join(self.robots),
         )
@@ -239,6 +246,9 @@ class RobosuiteEnv(SteppedEnv):
         else:
             self.simulation.begin_episode()
         self._actions.begin_episode(self.simulation)
+        if self._tracker is not None:
+            (own_draws,) = self.np_random.spawn(1)  # no other draw differs by these
+            self._tracker.begin_episode(own_draws)
         self._diverged = self._divergences()
         self._steps_taken = 0
         self.holding = False

@@ -16,19 +16,22 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.detection.channel_columns import columns_where
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import Part, prefix_of
 from asm_gym.envs.mujoco_views import Floats, Ints, Views
-from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.spec import HANDLED, MOTOR, Channel, StreamSpec
 
 if TYPE_CHECKING:
     from asm_gym.envs.robosuite_backend import ObjectSensors
+    from asm_gym.envs.simulated_tracker import HandledObjects
 
 Corruption = Callable[[NDArray[np.float64]], None]  # a sensor fault: edits a measured row in place
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
 """The channel groups of a stream by default, in the order of a row."""
 
-EXTRA_GROUPS = ("contact", "object")  # groups that no real robot measures about itself
+# groups that no real robot measures about itself, and what a tracker of objects measures
+EXTRA_GROUPS = ("contact", "object", HANDLED)
 
 
 class _Sensor(NamedTuple):
@@ -42,6 +45,7 @@ class _Sensor(NamedTuple):
     noise: float = 0.0  # standard deviation [unit]
     # step between readings [unit]; 0 for what is computed from several sensors
     resolution: float = 0.0
+    commanded: bool = False  # put out by a controller: it predicts, and is not judged
 
 
 # 15 bits of a turn [rad]: the link-side encoders of DLR's light-weight arm, the iiwa's ancestor.
@@ -62,7 +66,7 @@ _SENSORS = (
     _Sensor(
         "joint_velocity", "joint", "rad/s", "qvel", "dofs", noise=3e-3, resolution=_COUNT / 0.05
     ),
-    _Sensor("commanded_torque", "torque", "N m", "ctrl", "motors"),
+    _Sensor("commanded_torque", "torque", "N m", "ctrl", "motors", commanded=True),
     _Sensor("measured_torque", "torque", "N m", "mean", kernels.MOTOR, noise=0.1, resolution=0.02),
     _Sensor("external_torque", "torque", "N m", "mean", kernels.EXTERNAL, noise=0.15),
     _Sensor("external_torque_peak", "torque", "N m", "peak", kernels.EXTERNAL, noise=0.3),
@@ -169,6 +173,7 @@ def _channel(sensor: _Sensor, prefix: str, size: int, part: Part) -> Channel:
         group=sensor.group,
         resolution=sensor.resolution,
         stops=stops,
+        commanded=sensor.commanded,
     )
 
 
@@ -231,7 +236,9 @@ class Senses:
         if chosen:
             self.stream_spec = replace(spec, channels=chosen)
         self._carried = _columns(spec, [c.name for c in chosen])
-        self._noise = spec.noise * noise
+        self._tracked = columns_where(spec, lambda channel: channel.group == HANDLED)
+        # The tracker's readings have their noise already.
+        self._noise = np.delete(spec.noise, self._tracked) * noise
         self._resolution = spec.resolution
         if noise == 0:
             self._resolution = np.zeros(spec.size)
@@ -258,26 +265,32 @@ class Senses:
         faults: Sequence[Corruption],
         rng: np.random.Generator,
         within_step: bool = False,
+        tracker: HandledObjects | None = None,
     ) -> Reading:
         """Read every sensor once, over the time since the last row of the stream: noise, faults, resolution.
 
-        Within a step, objects keep their last pose if the stream does not carry them.
+        Within a step, objects keep their last pose if the stream does not carry them. ``tracker`` tells of handled
+        objects, where there are channels of ``HANDLED``.
         """
         if faults or self._needs_objects or not within_step:
             self._object_poses = objects.read()
         other_values = np.concatenate([*self._object_poses, action], dtype=np.float64)
         row = sense(other_values, self._noise, rng)
-        if faults:
+        was_finite = True
+        if faults or tracker is not None:
             was_finite = bool(np.isfinite(row).all())
-            for corrupt in faults:
-                corrupt(row)
+        if tracker is not None:
+            row = np.insert(row, self._tracked[0], tracker.read())
+        for corrupt in faults:
+            corrupt(row)
 
         stream = np.empty(len(self._carried), np.float32)
         observed = np.empty(len(self._observed), np.float32)
         row_finite, stream_finite = kernels.finish(
             row, self._resolution, self._carried, stream, self._observed, observed
         )
-        if faults:  # a fault that reads NaN is no fault of the simulation
+        # A fault that reads NaN, or a pose that is missing, is no fault of the simulation.
+        if faults or tracker is not None:
             row_finite = was_finite
             stream_finite = was_finite
         return Reading(

@@ -16,6 +16,7 @@ from asm_gym.envs.actions import Actions
 from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.envs.robosuite_backend import ObjectSensors
 from asm_gym.envs.sensors import Corruption, Reading, Senses
+from asm_gym.envs.simulated_tracker import HandledObjects
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.undoable_edits import SimulatorEdits
 from asm_gym.spec import Channel
@@ -33,6 +34,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     _actions: Actions  # the action space, and how actions reach the controllers
     _objects: ObjectSensors
     _senses: Senses
+    _tracker: HandledObjects | None  # of handled objects, where the stream has such channels
     _row_substeps: int
 
     def __init__(self, substeps: int) -> None:
@@ -156,6 +158,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             self.corruptions,
             self.np_random,
             within_step=within_step,
+            tracker=self._tracker,
         )
 
     def _forces(self, unstable: bool) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from asm_gym.faults.fault import (
     steady_force,
     within,
 )
+from asm_gym.spec import HANDLED
 from asm_gym.validation import check_choice
 
 _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
@@ -38,7 +39,7 @@ def movable(env: RobosuiteEnv) -> dict[str, int]:
 class ObjectFault(Fault):
     """One that acts on an ``object``, such as ``cube``; on the first of the task where empty."""
 
-    groups = ("gripper", "wrench", "torque", "object")
+    groups = ("gripper", "wrench", "torque", "object", HANDLED)
 
     object: str = ""
 

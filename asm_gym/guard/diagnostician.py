@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.channel_columns import handled_columns
 from asm_gym.detection.contact_limits import FREE_FORCE
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.contact_estimator import ContactEstimator
@@ -29,6 +30,7 @@ from asm_gym.spec import StreamSpec
 
 CALM_S = 1.0  # after so long without an alarm, what comes next has a cause of its own [s]
 SURE = 0.5  # a family that is less probable is unknown
+MOST_OF_OBJECT = 0.8  # share of the surprise from which on it is that of a handled object
 
 NO_CAUSE = Cause(
     family="unknown",
@@ -98,6 +100,7 @@ class Diagnostician:
         self._diagnosis = diagnosis
         self._responses = responses
         self._responds = responds
+        self._handled = handled_columns(spec)
         # By which a joint is found blocked.
         self._blocked_rows = 1 + round(LASTING["actuator"] / spec.dt)
         self._contact = None
@@ -133,6 +136,8 @@ class Diagnostician:
         """Return what is to be done about an alarm."""
         if evidence.only_lost:
             return Prescription(_complete_missing(evidence))
+        if self._only_of_object(evidence):
+            return self._without_object()
         incident = self.incidents.setdefault(evidence.index, Incident())
         if evidence.robot.knocked and not evidence.certain:
             return Prescription(self._brake(incident, evidence))
@@ -159,8 +164,25 @@ class Diagnostician:
             return Prescription(response)
         return Prescription(response, cause.columns)
 
+    def _only_of_object(self, evidence: RowEvidence) -> bool:
+        """Return whether a row surprises by a handled object, and nothing else is the matter."""
+        is_more = evidence.certain or evidence.fast or bool(evidence.robot.knocked)
+        if not self._handled.size or is_more:
+            return False
+        shares = np.nan_to_num(evidence.attribution, posinf=0.0)
+        return bool(shares[self._handled].sum() > MOST_OF_OBJECT * shares.sum())
+
+    def _without_object(self) -> Prescription:
+        """Return what is done about an object, or its tracker: it endangers nobody, and the other senses judge on."""
+        cause = _certain("object", "handled object")
+        if not self._responds:
+            return Prescription(Response("", cause))
+        return Prescription(Response("complete", cause, case="object"), self._handled)
+
     def instead_of_completing(self, response: Response) -> Response:
         """Return what is done where the sensors at fault cannot be completed."""
+        if response.case == "object":
+            return response._replace(name="go on")
         return response._replace(name=self._responses["unknown"])
 
     def _brake(self, incident: Incident, evidence: RowEvidence) -> Response:

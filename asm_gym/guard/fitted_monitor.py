@@ -15,6 +15,7 @@ from asm_gym.exceptions import SpecMismatch
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
+from asm_gym.stream_view import StreamView
 from asm_gym.validation import check_number, short_repr
 
 LOG = logging.getLogger("asm_gym.safety")
@@ -81,7 +82,7 @@ def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -
 def _check_stream(learned: StreamSpec, watched: StreamSpec) -> None:
     """Raise SpecMismatch unless a monitor of the stream ``learned`` can read ``watched``."""
     try:
-        learned.require(watched, "the monitor")
+        StreamView(offered=watched, wanted=learned)
     except SpecMismatch as error:
         multiple = whole_multiple(watched.dt, learned.dt)
         if multiple < 2:

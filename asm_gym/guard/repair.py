@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.channel_columns import handled_columns
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.hand_check import HandCheck
 from asm_gym.guard.robot_facts import NO_COLUMNS
@@ -69,6 +70,12 @@ class Repair:
         self._hands = hands
         self._spec = completion.spec
         self._senses = completion.senses
+        # Sensors that tell of no part of the robot: it goes on without them.
+        self._of_objects = {
+            name
+            for name, columns in completion.sensors
+            if np.isin(columns, handled_columns(completion.spec)).all()
+        }
         # Rows in which changes are taken from what was not yet repaired.
         self._settling_rows = 2 * completion.senses.lag + 1
         self._sensors: dict[str, MissingSensor] = {}
@@ -91,7 +98,8 @@ class Repair:
         """False once a sense that no other tells of is missing for long, any for very long, or too many at a time."""
         if self.missing[self._spec.sensory].mean() > MOST_MISSING:
             return False
-        oldest = max((sensor.age for sensor in self._sensors.values()), default=0)
+        ages = [s.age for name, s in self._sensors.items() if name not in self._of_objects]
+        oldest = max(ages, default=0)
         return self._unchecked <= self._rows_in(TRUST_S) and oldest <= self._rows_in(LONGEST_S)
 
     @property

@@ -259,7 +259,7 @@ def leverage(a: Array, R: Array, Q: Array, groups: Ints, changes_last: Ints) -> 
 def normalised_errors(
     rows: ScaledRows, association: Association, wiring: Wiring
 ) -> tuple[Array, Array]:
-    """Return ε (B, X), 0 where a row is not whole, and f(h) (B, M)."""
+    """Return ε (B, X), 0 where a row is not whole, by the precision of rows, and f(h) (B, M)."""
     a = association
     f = hidden_units(rows.inputs, a.V)
     out = complete_by_spans(f, rows.inputs, a.U, a.D, wiring.spans)
@@ -267,7 +267,8 @@ def normalised_errors(
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
             error = (rows.changes[n, i] - out[n, i]) / a.remainder[i]
-            out[n, i] = rows.whole[n, 0] * error * np.exp(np.float32(-0.5) * spread[n, i])
+            weight = rows.whole[n, 0] * rows.precision[n, i]
+            out[n, i] = weight * error * np.exp(np.float32(-0.5) * spread[n, i])
     if a.R.shape[0]:
         far = leverage(rows.inputs, a.R, a.Q, wiring.groups, wiring.changes_last)
         scale = a.leverage_scale

@@ -131,13 +131,13 @@ class Completion:
         sensory = x[:, self.spec.sensory]
         before = np.concatenate([sensory[:1], sensory[:-1]])
         first, second = self.products.T
-        return np.hstack([sensory, before, x[:, self.spec.motor], x[:, first] * x[:, second]])
+        return np.hstack([sensory, before, x[:, self.spec.commanded], x[:, first] * x[:, second]])
 
     def involved(self, missing: Mask) -> Mask:
         """Return the mask (Y,) of the entries of y in which columns of ``missing`` (D,) take part."""
         sensory = missing[self.spec.sensory]
         products = missing[self.products].any(axis=1)
-        return np.concatenate([sensory, sensory, missing[self.spec.motor], products])
+        return np.concatenate([sensory, sensory, missing[self.spec.commanded], products])
 
     def filling(self, missing: Mask) -> Filling:
         """Return how to complete the senses of ``missing`` (D,) from all others."""
@@ -250,4 +250,4 @@ def _split(name: str) -> tuple[str, str]:
 
 def _entries(spec: StreamSpec, products: int) -> int:
     """Return the length Y of y."""
-    return 2 * len(spec.sensory) + len(spec.motor) + products
+    return 2 * len(spec.sensory) + len(spec.commanded) + products

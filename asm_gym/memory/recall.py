@@ -59,7 +59,7 @@ def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
     spec = reader.spec
     standard = np.zeros((T, B, spec.size))
     standard[:, :, spec.sensory] = recalled.senses[:, :, : len(spec.sensory)]
-    standard[:, :, spec.motor] = recalled.commands
+    standard[:, :, spec.commanded] = recalled.commands
     return reader.mean + reader.spread * standard
 
 

@@ -75,7 +75,8 @@ class MemoryModel(ScaledModel):
     ) -> Self:
         lag = self.lag
         trajectories = []
-        for reading in self.read_nominal(episodes):
+        readings = self.read_nominal(episodes)
+        for reading in readings:
             inputs = reading.inputs[lag:]  # before these no change is known
             trajectories.append(Trajectory(reading.senses[::lag], reading.commands[::lag], inputs))
         senses = self.senses_
@@ -91,7 +92,9 @@ class MemoryModel(ScaledModel):
         )
         self.crossfitted = {}
         ends = np.cumsum([len(trajectory.inputs) for trajectory in trajectories])[:-1]
-        for episode, errors in zip(episodes, np.split(trained.errors, ends), strict=True):
+        errors_of_episodes = np.split(trained.errors, ends)
+        for episode, reading, errors in zip(episodes, readings, errors_of_episodes, strict=True):
+            errors *= reading.precision[lag:]
             errors[:lag] *= UNSURE
             unknown = np.zeros((lag, errors.shape[1]), errors.dtype)
             self.crossfitted[id(episode)] = np.vstack([unknown, errors])
@@ -127,7 +130,7 @@ class MemoryModel(ScaledModel):
                 f"which cannot be loaded as {self.dynamics!r}"
             )
         dynamics = DYNAMICS[self.dynamics]
-        of_network = dynamics.shapes(self.hidden_size, senses.size, len(self.spec.motor))
+        of_network = dynamics.shapes(self.hidden_size, senses.size, len(self.spec.commanded))
         shapes = of_network | association_shapes(senses.inputs, units, len(self.spec.sensory))
         if not len(learned.get("R", ())):  # leverage was not learned, from few rows
             shapes["R"] = (0, senses.inputs)
@@ -175,7 +178,9 @@ class MemoryModel(ScaledModel):
             return self.motor_.command(situation(senses, last_rows))
         expected = self.network.run_on(state.traces).expected
         motor = self.spec.motor
-        action = senses.mean[motor] + senses.spread[motor] * expected[:, senses.size :]
+        is_action = np.isin(self.spec.commanded, motor)
+        standard = expected[:, senses.size :][:, is_action]
+        action = senses.mean[motor] + senses.spread[motor] * standard
         return action.astype(np.float32)
 
     def _layout(self, senses: StreamScaler) -> ChangeLayout:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from asm_gym.checkpoint import read_header
 from asm_gym.spec import StreamSpec
+from asm_gym.stream_view import misfits_of
 from asm_gym.validation import check_choice, typed
 
 SHIPPED_FOLDER = Path(__file__).resolve().parent.parent / "pretrained"
@@ -53,7 +54,7 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
             misfits.append(f"robot: {known.source} against {spec.source}")
         if own_controller != controller:
             misfits.append(f"controller: {own_controller} against {controller}")
-        misfits += known.difference(spec)
+        misfits += misfits_of(known, spec)
         if not misfits:
             return name
         lines.append(f"  {name}: {'; '.join(misfits)}")

@@ -34,6 +34,7 @@ from asm_gym.policies.hold import Hold
 from asm_gym.policies.policy import Policy
 from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import layers
+from asm_gym.stream_view import StreamView
 from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.capabilities import controller_of, robots_of
 from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes, askable
@@ -49,7 +50,8 @@ class Guarding:
     guard: Guard
     """The guard: its table of robots, and how often each alarm term held."""
 
-    _spec: StreamSpec  # of the streams that are watched
+    _spec: StreamSpec  # of the streams
+    _view: StreamView  # of them, as the monitor reads them
     _period: float  # control period [s]
     _rows_per_step = 1
     _alarms: NDArray[np.int64]  # (n,) steps in alarm so far in the running episodes
@@ -100,6 +102,8 @@ class Guarding:
         refuse_counts(self.env, type(self).__name__, options.on_alarm)
         check_answer(monitor)
         self._check(monitor)
+        self._view = StreamView(offered=self._spec, wanted=monitor.spec)
+        self._view.describe()
 
         recorded: ActionMeaning | None = None
         recorded_json = getattr(monitor, "about", {}).get(ACTIONS)

@@ -148,7 +148,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._preview = Preview(at=None)
         self._previewed_actions = 0  # of the previewed chunk, not executed yet
         if self._facts.meaning is not None:
-            self.guard.sense(np.array(self._source.first(observation, info))[None])
+            self.guard.sense(self._view.rows(np.array(self._source.first(observation, info))[None]))
         self._ended = False
         self._executed = np.zeros(0, np.float32)
         info["overridden"] = bool(info.get("overridden"))
@@ -181,7 +181,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         own_chunk = checked_chunk(passed_on(chunk, outermost, self), self._box.shape)
         row = self._row
         if row is None:
-            row = self._source.first(self._observation, self._first_info)
+            row = self._view.rows(self._source.first(self._observation, self._first_info))
         last = self._facts.rest
         if self._executed.size:
             last = self._executed
@@ -231,7 +231,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         row, failure = sensed_row(
             lambda: self._source.row(observation, self._executed, info), self._spec.size
         )
-        sensed = SensedRows(rows=row[None], load=load_felt(self._facts, info), infos=info)
+        rows = self._view.rows(row[None])
+        sensed = SensedRows(rows=rows, load=load_felt(self._facts, info), infos=info)
         if failure:
             return sensed._replace(failures={0: failure})
         return sensed
@@ -297,7 +298,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     def _judge_within_step(self, row: Floats32) -> None:
         """Judge a row that the environment senses in the middle of a step; a reflex acts at once."""
-        report = self.guard.judge(SensedRows(row[None]), self._executed_row(), ends_step=False)
+        rows = self._view.rows(row[None])
+        report = self.guard.judge(SensedRows(rows), self._executed_row(), ends_step=False)
         self._reports.append(report)
         takes_over = self.guard.overriding[0] and not report.robots["overridden"][0]
         if takes_over:
@@ -312,14 +314,14 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             return observation
         row, missing = repaired[0]
         if "stream" in info:
-            info["stream"] = row.copy()
+            info["stream"] = self._view.written_back(row, info["stream"])
         if self._observation_map is None:
             return observation
         return self._observation_map.repaired(observation, row, missing)
 
     def _describe(self, reports: Sequence[RowReport]) -> Callable[[], AsmInfo]:
         facts = self._facts
-        spec = self._spec
+        spec = self.monitor.spec
         commanded: Any = None  # nothing was done before the first step
         if self._row is not None:
             commanded = self._executed

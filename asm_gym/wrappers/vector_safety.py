@@ -201,7 +201,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         present = np.asarray(infos.get("_stream", everyone))
         shape = self.num_envs, size
         if self._has_stream and present.all() and np.shape(stream) == shape:
-            return SensedRows(np.asarray(as_float32(stream)), load, infos=infos)
+            rows = self._view.rows(np.asarray(as_float32(stream)))
+            return SensedRows(rows, load, infos=infos)
 
         def read(member: int) -> Floats32:
             if not self._has_stream:
@@ -217,7 +218,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             rows[member], failure = sensed_row(partial(read, member), size)
             if failure:
                 failures[member] = failure
-        return SensedRows(rows, load, failures, infos)
+        return SensedRows(self._view.rows(rows), load, failures, infos)
 
     def send_command(self, command: Command) -> tuple[Any, ...]:
         """Step the members as the guard decided; return what that gives."""
@@ -275,7 +276,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             repaired = self._observation_map.repaired(observation, row, missing)
             observations = _with(observations, member, repaired)
             if "stream" in infos:
-                infos["stream"] = _with(infos["stream"], member, row)
+                written = self._view.written_back(row, infos["stream"][member])
+                infos["stream"] = _with(infos["stream"], member, written)
         return observations
 
     def _begin(self, begun: Mask) -> RowReport:
@@ -292,7 +294,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
 
     def _describe(self, reports: Sequence[RowReport]) -> Callable[[], dict[str, Any]]:
         facts = self._facts
-        spec = self._spec
+        spec = self.monitor.spec
         commanded = self._commanded.copy()
         executed = self._executed.copy()
         step: dict[str, Any] = {

@@ -61,7 +61,7 @@ class Kalman(StreamModel):
 
         before = np.concatenate([rows[:-1] for rows in states])  # (N, X)
         after = np.concatenate([rows[1:] for rows in states])
-        commands = np.concatenate([episode.stream[1:, self.spec.motor] for episode in episodes])
+        commands = np.concatenate([episode.stream[1:, self.spec.commanded] for episode in episodes])
         inputs = _inputs(before, commands.astype(np.float64))
         penalty = self.ridge * len(inputs) * np.eye(inputs.shape[1])
         gram = inputs.T @ inputs + penalty
@@ -89,7 +89,7 @@ class Kalman(StreamModel):
     def predict(self, state: KalmanState, rows: Floats) -> tuple[KalmanState, ModelOutput]:
         learned = self.learned_
         y = (rows[:, self.spec.sensory] - learned["mean"]) / learned["spread"]
-        inputs = _inputs(state.estimate, zero_unless_finite(rows[:, self.spec.motor]))
+        inputs = _inputs(state.estimate, zero_unless_finite(rows[:, self.spec.commanded]))
         has_begun = state.steps[:, None] > 0
         predicted = inputs @ learned["weights"]
         expected = np.where(has_begun, predicted, zero_unless_finite(y))

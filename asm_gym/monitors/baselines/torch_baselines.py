@@ -208,7 +208,7 @@ class GRU(TorchModel):
     def module(self, senses: StreamScaler) -> nn.Module:
         return _GRUModule(
             senses=senses.size,
-            commands=len(self.spec.motor) + 1,
+            commands=len(self.spec.commanded) + 1,
             changes=len(self.spec.sensory),
             hidden=self.hidden_size,
         )
@@ -272,10 +272,10 @@ class LogpZO(TorchModel):
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
-        return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.motor])
+        return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.commanded])
 
     def module(self, senses: StreamScaler) -> nn.Module:
-        size = senses.size + len(self.spec.motor)
+        size = senses.size + len(self.spec.commanded)
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise([size + 1, *[self.width] * LAYERS]):
             layers += [nn.Linear(inputs, outputs), nn.SiLU()]

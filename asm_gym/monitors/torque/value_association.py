@@ -315,7 +315,7 @@ class ValueAssociation(ScaledModel):
                 return {}
         # Each feature of all joints comes before the next feature.
         of_first_joint = 3 * senses + joints * np.arange(features_per_joint)
-        commands = np.arange(inputs - len(self.spec.motor) - 1, inputs)
+        commands = np.arange(inputs - len(self.spec.commanded) - 1, inputs)
         speeds = features.speeds + senses * features.from_changes
         own_inputs = {}
         for joint, torque in enumerate(self._torques.tolist()):

@@ -1,0 +1,290 @@
+"""A tracker of object poses in the simulation, with noise, rate and dropouts of a real one, at each hand.
+
+    pose      5 mm and 1°, 20 times a second
+    dropout   2 % of all poses; near the hand it hides the object now and then, for 3 poses in the mean, at most 8
+    object    the nearest to the fingers of those within 1.5 m; another one once it has been nearer by 2 cm for 0.15 s
+    missing   a pose that is missing for longer than that explains makes all numbers NaN
+
+Draws come from a generator of its own, so that no other sensor reads anything else by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs.arms import prefix_of
+from asm_gym.envs.mujoco_views import Floats
+from asm_gym.envs.object_tracker import (
+    CARRIED,
+    SENSED,
+    UNDECIDED,
+    clear,
+    correct,
+    decide,
+    new_hand,
+    new_track,
+    predict,
+    rotation,
+    write_sense,
+)
+from asm_gym.envs.simulation import Simulation
+from asm_gym.spec import CARRIED_CHANNEL, HANDLED, Channel
+
+
+@dataclass(frozen=True)
+class TrackerQuality:
+    """How well poses are measured."""
+
+    position_noise: float = 0.005  # standard deviation of each coordinate [m]
+    turn_noise: float = float(np.deg2rad(1.0))  # about each axis [rad]
+    period: float = 0.05  # between two poses [s]
+    dropout: float = 0.02  # share of poses that are missing
+    hiding: float = 0.05  # chance that the hand begins to hide an object, at each pose near it
+    shown_again: float = 1 / 3  # chance that it shows it again, at each pose
+    longest_hidden: int = 8  # poses
+
+
+QUALITY = TrackerQuality()
+# Of the hand's position, velocity and angular velocity, as its own sensors have it.
+HAND_NOISE = np.array([3e-4] * 3 + [3e-3] * 3 + [1e-2] * 3 + [0.0])
+NEAR_HAND = 0.12  # the hand may hide an object so near to it [m]
+LONGEST_HIDDEN_S = 0.75  # a pose of an object near the hand is missing for at most so long [s]
+LONGEST_UNSEEN_S = 0.3  # and of another [s]
+GIVEN_UP_S = 2.0  # after so long another object is tracked [s]
+VIEW = 1.5  # farthest that an object may be from the hand to be seen [m]
+NEARER_BY = 0.02  # another object is nearer from this difference on [m]
+NEARER_FOR_S = 0.15  # and for so long [s]
+FINGERS_MOVE = 0.02  # from this speed of a finger on [m/s], [rad/s]
+
+
+class HandledObjects:
+    """Tracks the object at each hand of a loaded model.
+
+    Args:
+        simulation: of the model.
+        noise: scales the noise of poses.
+        quality: of the tracker.
+
+    Attributes:
+        channels: ten numbers for each hand.
+    """
+
+    def __init__(
+        self, simulation: Simulation, noise: float, quality: TrackerQuality = QUALITY
+    ) -> None:
+        model = simulation.model
+        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        self._bodies = model.jnt_bodyid[is_free]
+        self._time: float = 0.0
+        self._data = simulation.data
+        parts = simulation.parts
+        self._hands = [
+            TrackedHand(simulation, arm, self._bodies, noise, quality) for arm in range(len(parts))
+        ]
+        channels: list[Channel] = []
+        for arm in range(len(parts)):
+            channels += _channels(prefix_of(arm, len(parts)), quality)
+        self.channels = tuple(channels)
+
+    def begin_episode(self, rng: np.random.Generator) -> None:
+        """Forget all objects; later draws come from ``rng``."""
+        self._time = float(self._data.time)
+        for hand in self._hands:
+            hand.begin_episode(rng)
+
+    def read(self) -> Floats:
+        """Return the numbers (SENSED × hands,) at the present time."""
+        elapsed = float(self._data.time) - self._time
+        self._time = float(self._data.time)
+        return np.concatenate([hand.read(elapsed) for hand in self._hands])
+
+
+class TrackedHand:
+    """Tracks the object at one hand.
+
+    Attributes:
+        target: body of the tracked object; -1 for none. To set it is a fault of the tracker.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        arm: int,
+        bodies: Sequence[int],
+        noise: float,
+        quality: TrackerQuality,
+    ) -> None:
+        self._data = simulation.data
+        robot, name = simulation.parts[arm]
+        self._site = robot.eef_site_id[name]
+        self._body = simulation.model.body(robot.robot_model.eef_name[name]).id
+        self._motion = simulation.proprioception.last[arm]
+        fingers: Any = ()
+        if robot.gripper[name].joints:
+            fingers = robot._ref_gripper_joint_vel_indexes[name]
+        self._fingers = np.array(fingers, np.intp)
+        self._bodies = np.array(bodies, np.intp)
+        self._noise = noise
+        self._quality = quality
+        self.track = new_track()
+        self._hand = new_hand()
+        self._numbers = np.zeros(SENSED)
+        self.begin_episode(np.random.default_rng(0))
+
+    def begin_episode(self, rng: np.random.Generator) -> None:
+        """Forget the object."""
+        self._rng = rng
+        self.target = -1
+        self._nearer = -1  # another object that is nearer
+        self._nearer_s = 0.0
+        self._hidden = 0  # poses for which the hand hides the object
+        self._shown = 0  # poses measured since it did
+        self._pose_due_s = 0.0
+        clear(self.track)
+        self._look_at_hand()
+        self.track.hand_position[:] = self._hand.position
+        self.track.hand_orientation[:] = self._hand.orientation
+
+    def read(self, elapsed: float) -> Floats:
+        """Return the numbers (SENSED,) after ``elapsed`` [s]; NaN where a pose has been missing for too long."""
+        self._look_at_hand()
+        distances = self._distances()
+        self._choose(distances, elapsed)
+        predict(self.track, self._hand, elapsed)
+        self._pose_due_s -= elapsed
+        if self._pose_due_s <= 1e-9:
+            self._pose_due_s += self._quality.period
+            self._measure()
+        decide(self.track, self._hand, elapsed)
+        if self._is_lost():
+            return np.full(SENSED, np.nan)
+        write_sense(self.track, self._hand, self._numbers)
+        return self._numbers + self._noise * HAND_NOISE * self._rng.standard_normal(SENSED)
+
+    def _look_at_hand(self) -> None:
+        """Read pose and motion of the hand, which the arm's own sensors measure well."""
+        hand = self._hand
+        hand.position[:] = self._data.site_xpos[self._site]
+        hand.orientation[:] = self._data.xmat[self._body].reshape(3, 3)
+        twist = self._motion[kernels.VELOCITY]
+        hand.velocity[:] = twist[:3]
+        hand.turn_rate[:] = twist[3:]
+        speeds = np.abs(self._data.qvel[self._fingers])
+        hand.fingers_move = bool((speeds > FINGERS_MOVE).any())
+
+    def _distances(self) -> Floats:
+        """Return the distances (N,) of the objects from the fingers [m]."""
+        offsets = self._data.xpos[self._bodies] - self._hand.position
+        return np.sqrt(np.einsum("ni,ni->n", offsets, offsets))
+
+    def _choose(self, distances: Floats, elapsed: float) -> None:
+        """Take up the nearest object, if none is tracked or another has been nearer for long enough."""
+        if not len(distances):
+            return
+        nearest = int(distances.argmin())
+        body = int(self._bodies[nearest])
+        gave_up = self.track.unseen_s > GIVEN_UP_S
+        if self.target < 0 or (gave_up and body != self.target):
+            if distances[nearest] < VIEW:
+                self._take_up(body)
+            return
+        is_handled = self.track.carrier in (CARRIED, UNDECIDED)
+        own = distances[self._bodies == self.target]
+        nearer = bool(own.size) and distances[nearest] < own[0] - NEARER_BY
+        if is_handled or not nearer or own[0] > VIEW:
+            self._nearer_s = 0.0
+            return
+        if body != self._nearer:
+            self._nearer = body
+            self._nearer_s = 0.0
+        self._nearer_s += elapsed
+        if self._nearer_s > NEARER_FOR_S:
+            self._take_up(body)
+
+    def _take_up(self, body: int) -> None:
+        """Track another object from now on."""
+        self.target = body
+        self._nearer_s = 0.0
+        self._hidden = 0
+        clear(self.track)
+
+    def _measure(self) -> None:
+        """Correct the track by a pose of the object, if it is seen."""
+        if self.target < 0:
+            return
+        quality = self._quality
+        position_error = quality.position_noise * self._noise * self._rng.standard_normal(3)
+        turn_error = quality.turn_noise * self._noise * self._rng.standard_normal(3)
+        is_dropped, begins_to_hide, shows_again = self._rng.random(3)
+        position = self._data.xpos[self.target]
+        distance = float(np.linalg.norm(position - self._hand.position))
+        self._hide(distance, begins_to_hide, shows_again)
+        is_seen = distance < VIEW and not self._hidden and is_dropped >= quality.dropout
+        if not is_seen:
+            return
+        self._shown += 1
+        orientation = self._data.xmat[self.target].reshape(3, 3)
+        turned = rotation(turn_error) @ orientation
+        correct(self.track, position + position_error, turned, quality.period)
+
+    def _hide(self, distance: float, begins_to_hide: float, shows_again: float) -> None:
+        """Begin to hide the object by the hand, go on with it or end it, by draws from [0, 1)."""
+        quality = self._quality
+        if self._hidden:
+            self._hidden += 1
+            is_over = shows_again < quality.shown_again or self._hidden > quality.longest_hidden
+            if is_over or distance > NEAR_HAND:
+                self._hidden = 0
+                self._shown = 0
+        elif distance < NEAR_HAND and self._shown >= 3 and begins_to_hide < quality.hiding:
+            self._hidden = 1
+
+    def _is_lost(self) -> bool:
+        """Return whether the pose of an object has been missing for longer than the hand may hide it."""
+        if self.target < 0:
+            return False
+        offset = self.track.position - self._hand.position
+        longest = LONGEST_UNSEEN_S
+        if self.track.poses and np.linalg.norm(offset) < NEAR_HAND:
+            longest = LONGEST_HIDDEN_S
+        return bool(self.track.unseen_s > longest + 1e-9)
+
+
+def _channels(prefix: str, quality: TrackerQuality) -> list[Channel]:
+    """Return the channels of one hand, with the noise that the filter leaves."""
+    left = 0.5  # of the noise of poses, by the filter's gains
+    rate_left = 1.5  # [1/s]
+    axes = ("x", "y", "z")
+    return [
+        Channel(
+            f"{prefix}object_position",
+            3,
+            "m",
+            noise=left * quality.position_noise,
+            group=HANDLED,
+            elements=axes,
+        ),
+        Channel(
+            f"{prefix}object_velocity",
+            3,
+            "m/s",
+            noise=rate_left * quality.position_noise,
+            group=HANDLED,
+            elements=axes,
+        ),
+        Channel(
+            f"{prefix}object_turn_rate",
+            3,
+            "rad/s",
+            noise=rate_left * quality.turn_noise,
+            group=HANDLED,
+            elements=axes,
+        ),
+        Channel(f"{prefix}{CARRIED_CHANNEL}", 1, group=HANDLED),
+    ]
