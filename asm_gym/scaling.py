@@ -295,8 +295,11 @@ def expect_events(
         c = scale.carried[i]
         if c < 0:
             continue
-        precision[j] = expectation(row[c], before[c], earlier[c])
-        if precision[j] == 0.0 or i == c:
+        if i != c:
+            precision[j] = expectation(row[c], before[c], earlier[c])
+        else:
+            precision[j] = 0.0  # what the tracker says of itself is a context
+        if precision[j] == 0.0:
             inputs[D + j] = 0.0
     for j in range(len(scale.slow)):
         i = scale.slow[j]
