@@ -233,7 +233,7 @@ def test_an_object_that_is_gone_is_missing_for_longer_than_a_dropout():
 def test_without_objects_the_sense_says_so():
     rows = np.array([Scene().tracked().read(DT) for _ in range(3)])
     np.testing.assert_array_equal(rows[:, -1], NO_POSE)
-    assert not rows[:, :-1].any()
+    assert np.abs(rows[:, :-1]).max() < 0.05  # noise alone
 
 
 # ---------------------------------------------------------------- in the stream of an environment

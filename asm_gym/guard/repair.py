@@ -70,11 +70,11 @@ class Repair:
         self._hands = hands
         self._spec = completion.spec
         self._senses = completion.senses
-        # Sensors that tell of no part of the robot: it goes on without them.
+        # The robot goes on without sensors that tell of no part of itself.
+        handled = handled_columns(completion.spec)
+        self._of_robot = np.setdiff1d(self._spec.sensory, handled)
         self._of_objects = {
-            name
-            for name, columns in completion.sensors
-            if np.isin(columns, handled_columns(completion.spec)).all()
+            name for name, columns in completion.sensors if np.isin(columns, handled).all()
         }
         # Rows in which changes are taken from what was not yet repaired.
         self._settling_rows = 2 * completion.senses.lag + 1
@@ -96,7 +96,7 @@ class Repair:
     @property
     def trusted(self) -> bool:
         """False once a sense that no other tells of is missing for long, any for very long, or too many at a time."""
-        if self.missing[self._spec.sensory].mean() > MOST_MISSING:
+        if self.missing[self._of_robot].mean() > MOST_MISSING:
             return False
         ages = [s.age for name, s in self._sensors.items() if name not in self._of_objects]
         oldest = max(ages, default=0)

@@ -275,7 +275,7 @@ def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
             "--action names the columns of commands"
         )
     elif not args.action:
-        yield f"read as commands, by name: {names}; the output of a controller would hide pushes"
+        yield f"read as commands, by name: {names}; --action names others"
 
 
 def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
