@@ -68,11 +68,11 @@ class Blame:
         senses = len(spec.sensory)
         self._now = np.zeros(spec.size, np.intp)  # entry of y of each column's value
         self._now[spec.sensory] = np.arange(senses)
-        self._now[spec.motor] = 2 * senses + np.arange(len(spec.motor))
+        self._now[spec.commanded] = 2 * senses + np.arange(len(spec.commanded))
         self._is_sensed = np.isin(np.arange(spec.size), spec.sensory)
         squares = [first for first, second in completion.products.tolist() if first == second]
         self._freedom = 1 + self._is_sensed + np.isin(np.arange(spec.size), squares)
-        self._first_product = 2 * senses + len(spec.motor)
+        self._first_product = 2 * senses + len(spec.commanded)
         with ONE_THREAD:
             _ = completion.precision  # an alarm must not wait for it
 
