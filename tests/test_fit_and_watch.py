@@ -290,7 +290,7 @@ def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(
     assert "0 alarms in 0 of 1 episodes" in capsys.readouterr().out
     assert main(["watch", str(tmp_path / "stuck.csv"), *how]) == 1
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        *("alarms.csv", "report.html", "surprise.png", "stream.png"),
+        *("alarms.csv", "incidents", "report.html", "surprise.png", "stream.png"),
     }
     alarms = read_text(tmp_path / "out" / "alarms.csv")
     assert 40 / RATE < alarms["from [s]"][0] < 60 / RATE

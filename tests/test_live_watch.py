@@ -303,9 +303,8 @@ def test_alarms_of_one_cause_are_one(monitor):
     rows[[20, 28, 36, 75], 2] += 100.0  # at 50 Hz: a push, and another one
     events = []
     follow(lines(rows), monitor, events.append)
-    alarms = [event for event in events if event.kind == "alarm"]
-    assert len(alarms) == 2
-    assert [round(alarm.time / DT) for alarm in alarms] == [21, 76]
+    (alarm,) = [event for event in events if event.kind == "alarm"]
+    assert round(alarm.time / DT) == 21
 
 
 @pytest.mark.parametrize("rate", [20, 100])
@@ -419,7 +418,7 @@ def test_a_watch_in_a_pipe_that_nobody_reads_calls_its_hook(reader, monitor, tmp
     """Two faults: standard output fails at the first one, and the second is told all the same."""
     rows = episode(500).stream.copy()
     rows[30, 2] += 100.0
-    rows[65, 2] += 100.0
+    rows[65, 0] = np.inf
     monitor.save(tmp_path / "m.asm")
     heard = tmp_path / "heard"
     hook = f"cat >> {shlex.quote(str(heard))}"
@@ -439,8 +438,8 @@ def test_a_watch_in_a_pipe_that_nobody_reads_calls_its_hook(reader, monitor, tmp
     error = process.stderr.read()
     code = process.wait(60)
     said = [json.loads(line) for line in heard.read_text().splitlines()]
-    times = [round(event["time"] / DT) for event in said if event["reason"] == "surprise"]
-    assert times == [31, 66]
+    told = [(round(event["time"] / DT), event["reason"]) for event in said]
+    assert {(31, "surprise"), (66, "not finite")} <= set(told)
     if reader == "gone":
         assert code == 2
         assert "standard output" in error

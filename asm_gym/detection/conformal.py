@@ -3,7 +3,7 @@
 By the episode
     threshold    the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes; a value above it is an alarm
 By the hour
-    block        an episode; a longer one is cut into minutes, with a rest; an alarm counts once a block
+    block        an episode; a longer one is cut into minutes, with a rest; an incident counts once, see ``incidents``
     threshold    the least maximum q of n healthy blocks with   #{i: m_i > q} + 1 <= r (T_1 + … + T_n)
 
 m_i is the largest value in block i, T_i its duration [h], and r the rate [1/h]. The loss of a block,
@@ -23,7 +23,7 @@ conformal risk control), Theorem 1; Hill 1975 and Weissman 1978 (the tail; the 0
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -44,6 +44,7 @@ MOST_PER_HOUR = 1e6
 ROUNDING = 1e-9
 ENOUGH = 5.0  # maxima that may exceed a threshold, from which on they are counted
 FEWEST_IN_TAIL = 50  # maxima that a model of their tail takes
+MOST_COUNTED = 12  # thresholds at which incidents are counted, of maxima of all ranks
 MAXIMA_PER_ONE_IN_TAIL = 10  # one in so many maxima is in the tail
 # Added to the exponent of the tail: with these a Pareto law keeps a rate of 1 % from 100 maxima on.
 STANDARD_ERRORS = 0.6
@@ -187,7 +188,7 @@ class Blocks(NamedTuple):
     """Healthy operation in blocks."""
 
     maxima: Floats  # (n,) the largest value in each
-    hours: Floats  # (n,) duration of each
+    hours: Floats  # (n,) duration of each; 0 of another incident in a block
     group: Floats = np.zeros(0)  # (n,) number of its task; empty for one group
 
     @classmethod
@@ -212,11 +213,44 @@ class Blocks(NamedTuple):
             columns = columns[:2]  # without the group
         return cls(*columns)
 
+    def with_incidents(self, count: Callable[[float, int], int]) -> Self:
+        """Return the blocks with another of no duration for each incident beyond one a block.
+
+        Args:
+            count: returns the incidents at a threshold in the episodes of a group, by its number.
+        """
+        group_of_blocks = self.group
+        if not self.group.size:
+            group_of_blocks = np.zeros(len(self.maxima))
+        extra: list[tuple[float, float]] = []  # threshold, group
+        for group in np.unique(group_of_blocks):
+            maxima = np.sort(self.maxima[group_of_blocks == group])[::-1]
+            ranks = np.unique(np.geomspace(1, len(maxima), MOST_COUNTED).astype(int)) - 1
+            level = float(maxima[0])
+            added = 0
+            for threshold in maxima[ranks]:
+                below = float(np.nextafter(threshold, -np.inf))
+                missing = count(below, int(group)) - int((maxima > below).sum()) - added
+                extra += [(level, float(group))] * missing
+                added += max(missing, 0)
+                level = float(threshold)
+        if not extra:
+            return self
+        thresholds, groups = np.transpose(extra)
+        all_groups = self.group
+        if self.group.size:
+            all_groups = np.concatenate([self.group, groups])
+        return type(self)(
+            maxima=np.concatenate([self.maxima, thresholds]),
+            hours=np.concatenate([self.hours, np.zeros(len(extra))]),
+            group=all_groups,
+        )
+
     @classmethod
     def restored(cls, kept: Floats) -> Blocks:
         """Read an ``array``. Raises ValueError where that is no maxima and hours."""
         fits = kept.ndim == 2 and len(kept) in (2, 3) and kept.size > 0
-        if not fits or not (kept[1] > 0).all():  # hours
+        if not fits or not (kept[1] >= 0).all() or not kept[1].any():  # hours
             raise ValueError(
                 f"blocks should be maxima and hours, (2, n) or (3, n), found {short_repr(kept)}"
             )

@@ -19,6 +19,7 @@ from asm_gym.detection.detector import BOUND, GAINS, Detector
 from asm_gym.detection.evidence import (
     HOURS_QUANTILE,
     HOURS_TAIL_INDEX,
+    POWER,
     TAIL_INDEX,
     Evidence,
     ceilings,
@@ -61,6 +62,7 @@ class EvidenceDetection:
     """
 
     name = "evidence"
+    power = POWER  # p
     arrays: tuple[str, ...] = (
         "whitening",
         "ceiling",

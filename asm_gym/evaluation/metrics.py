@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import alarms_in
 from asm_gym.evaluation.resampling import Calibration, Draws, Windows, Wins, resample
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpisode
 from asm_gym.evaluation.statistics import Floats, Rate, Share
@@ -62,7 +61,7 @@ def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
 
 
 def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
-    """Count alarms before any fault, and their hours; one that persists, or comes back within a minute, is one.
+    """Count incidents before any fault, and their hours; where shares are not kept, all is one cause.
 
     With an ``event``, ``"knock"`` or ``"stop"``, count the surprise that it excused instead.
     """
@@ -74,7 +73,7 @@ def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
             excused = trace.excused.get(event, np.zeros(len(trace)))
             surprise = np.where(trace.alarm, 0.0, excused)
         rows = trace.healthy_rows
-        count += alarms_in(surprise[:rows], trace.threshold, trace.dt)
+        count += trace.count_incidents(surprise[:rows])
         hours += rows * trace.dt / 3600
     return Rate(count, hours)
 

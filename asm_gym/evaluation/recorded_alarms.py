@@ -2,37 +2,61 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import TOGETHER_S, blamed, reason
+from asm_gym.data.alarm_reasons import blamed
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
+from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
 from asm_gym.data.schema import LOG_ORIGIN, LogSchema
 from asm_gym.detection.alarm_rule import rows_excused
+from asm_gym.detection.following_threshold import FollowingThreshold
+from asm_gym.detection.incidents import Incident, IncidentBook, power_of, rows_of_alarm
+from asm_gym.evaluation.incident_window import AFTER_S, BEFORE_S, IncidentWindow
 from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.evaluation.tables import Table
 from asm_gym.monitors.blame import reattribute_alarms
+from asm_gym.monitors.expectation import (
+    Expectation,
+    Expected,
+    shift_of_columns,
+    shifts_kept_in,
+)
 from asm_gym.readings import spans
 
-HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date")
-FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
+HEADINGS = (
+    *("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date"),
+    *("sensed", "expected", "±", "unit", "rows around it"),
+)
+Floats = NDArray[np.float64]
+MOST_NAMED = 3  # channels that the table of an hour names
 
 
 class Alarm(NamedTuple):
-    """One alarm of a recording."""
+    """One alarm of a recording: an incident."""
 
     log: str
     # Stamps of its first and last row, by the log's own clock; without one, the ends of their steps [s].
     start: float
     end: float
-    # The most surprising number when the alarm was raised; empty where a whole row was missing.
+    # The channel that blame points to when the alarm was raised; empty where a whole row was missing.
     channel: str
     why: str  # surprise, missing data, or not finite
     excess: float  # surprise of the worst row, in thresholds
     has_stamps: bool = False  # the log has a clock
+    row: int = 0  # index of its first row
+    column: int | None = None  # of the channel
+    group: str = ""  # of the channel
+    beside: Expected | None = None  # the channel in its first row beside what was expected
+    evidence: str = ""  # file of the rows around it
 
     @property
     def stamp(self) -> float | None:
@@ -51,51 +75,113 @@ class Alarm(NamedTuple):
     def cells(self) -> tuple[str, ...]:
         """Format for a table, under ``HEADINGS``."""
         times = (f"{self.start:.3f}", f"{self.end:.3f}")
-        return (self.log, *times, self.channel, self.why, f"{self.excess:.2f}", self.date)
+        beside = ("", "", "", "")
+        if self.beside is not None:
+            sensed, expected, plus_minus, unit = self.beside
+            beside = (f"{sensed:.5g}", f"{expected:.5g}", f"{plus_minus:.2g}", unit)
+        return (
+            *(self.log, *times, self.channel, self.why, f"{self.excess:.2f}", self.date),
+            *(*beside, self.evidence),
+        )
 
 
-def plain_cell(text: str) -> str:
-    """Return a cell of CSV that no spreadsheet takes for a formula: a name that looks like one is quoted."""
-    if text.startswith(tuple(FORMULA)):
-        return f"'{text}"
-    return text
+def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> list[Alarm]:
+    """Return every incident of an episode, in order, see ``asm_gym.detection.incidents``.
 
-
-def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
-    """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one."""
+    Args:
+        trace: the scored episode.
+        expectation: what channels should read.
+    """
     assert trace.attribution is not None
     assert trace.stream is not None
-    alarms: list[Alarm] = []
-    times = trace.times
-    newest: dict[str, int] = {}  # index of the newest alarm, by its reason
-    for first, stop in spans(trace.alarm):
-        row = trace.stream[first]
-        why = reason(row)
-        start = float(times[first])
-        end = float(times[stop - 1])
-        excess = float(trace.surprise[first:stop].max() / trace.threshold)
+    begins = set(trace.alarms)
 
-        index = newest.get(why)
-        if index is not None and start - alarms[index].end <= TOGETHER_S:
-            excess = max(excess, alarms[index].excess)
-            alarms[index] = alarms[index]._replace(end=end, excess=excess)
-            continue
+    def blame_of(row: int) -> int | None:
+        """Return the column that blame points to, in the first row of surprise over its threshold."""
+        if row not in begins or trace.attribution is None or trace.stream is None:
+            return None
+        return blamed(trace.stream[row], trace.attribution[row])
 
-        newest[why] = len(alarms)
-        alarm = Alarm(
-            log=trace.kind,
-            start=start,
-            end=end,
-            channel="",
-            why=why,
-            excess=excess,
-            has_stamps=trace.origin is not None,
-        )
-        column = blamed(row, trace.attribution[first])
-        if column is not None:
-            alarm = alarm._replace(channel=trace.channels[column])
+    book = IncidentBook(trace.power)
+    for row in rows_of_alarm(
+        surprise=trace.surprise,
+        shares_of=trace.raw_shares,
+        stream=trace.stream,
+        threshold=trace.threshold,
+        dt=trace.dt,
+        blame_of=blame_of,
+    ):
+        book.follow(row)
+    alarms = []
+    for incident in book.incidents:
+        alarm = _alarm(trace, incident)
+        if expectation is not None:
+            rows = trace.stream[max(alarm.row - 1, 0) : alarm.row + 1]
+            alarm = alarm._replace(beside=expectation.at_end(rows, incident.column))
         alarms.append(alarm)
     return alarms
+
+
+def _alarm(trace: ScoredEpisode, incident: Incident) -> Alarm:
+    """Return an incident as an alarm of a recording."""
+    first = round(incident.start / trace.dt) - 1
+    last = round(incident.last / trace.dt) - 1
+    alarm = Alarm(
+        log=trace.kind,
+        start=float(trace.times[first]),
+        end=float(trace.times[last]),
+        channel="",
+        why=incident.reason,
+        excess=incident.excess,
+        has_stamps=trace.origin is not None,
+        row=first,
+        column=incident.column,
+    )
+    if incident.column is None:
+        return alarm
+    alarm = alarm._replace(channel=trace.channels[incident.column])
+    if trace.groups:
+        alarm = alarm._replace(group=trace.groups[incident.column])
+    return alarm
+
+
+def window_of(trace: ScoredEpisode, alarm: Alarm) -> IncidentWindow:
+    """Return the rows around an alarm of an episode."""
+    assert trace.stream is not None
+    first = max(alarm.row - round(BEFORE_S / trace.dt), 0)
+    stop = min(alarm.row + round(AFTER_S / trace.dt) + 1, len(trace))
+    return IncidentWindow(
+        times=trace.times[first:stop].tolist(),
+        rows=trace.stream[first:stop],
+        surprise=(trace.surprise[first:stop] / trace.threshold).tolist(),
+        labels=trace.channels,
+        column=alarm.column,
+    )
+
+
+def by_hour(alarms: Sequence[Alarm], hours: float) -> Table:
+    """Return how many alarms began in each hour: of the day where the log has dates, else of the log.
+
+    Args:
+        alarms: of recordings.
+        hours: duration of all recordings [h].
+    """
+    counts: dict[tuple[str, int], Counter[str]] = {}
+    for alarm in alarms:
+        unit = "hour of the log"
+        hour = int(alarm.start // 3600)
+        if alarm.date:
+            unit = "hour of the day (UTC)"
+            hour = datetime.fromtimestamp(alarm.start, UTC).hour
+        counts.setdefault((unit, hour), Counter())[alarm.channel or alarm.why] += 1
+    rows = []
+    for (unit, hour), channels in sorted(counts.items()):
+        names = ", ".join(f"{name} {count}" for name, count in channels.most_common(MOST_NAMED))
+        rows.append((f"{hour:02d}", unit, str(channels.total()), names))
+    caption = f"Alarms by hour: {len(alarms)} in {hours:.3g} hours"
+    if hours > 0:
+        caption += f", {len(alarms) / hours:.3g} an hour"
+    return Table(caption, ("from", "hour", "alarms", "channels"), rows)
 
 
 def sensed_peak(trace: ScoredEpisode) -> float:
@@ -106,8 +192,12 @@ def sensed_peak(trace: ScoredEpisode) -> float:
 def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[ScoredEpisode]:
     """Score logs; rows that lack a number for at most ``bridge`` seconds are not judged."""
     dt = monitor.spec.dt
-    names = LogSchema.kept_in(getattr(monitor, "about", {}), monitor.spec).names_in_logs
-    surprises = monitor.score_episodes([log.episode for log in logs])
+    about = getattr(monitor, "about", {})
+    names = LogSchema.kept_in(about, monitor.spec).names_in_logs
+    groups = tuple(c.group for c in monitor.spec.channels for _ in c.labels)
+    shift = shift_of_columns(monitor.spec, shifts_kept_in(about))
+    surprises = monitor.score_episodes([recentred(log.episode, shift) for log in logs])
+    blame = getattr(monitor, "blame_", None)
     traces = []
     for (name, episode), surprise in zip(logs, surprises, strict=True):
         fault = episode.faults
@@ -123,14 +213,40 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
             excused=judged.excused_by_event,
             attribution=judged.attribution,
             channels=names,
+            groups=groups,
+            power=power_of(monitor),
             fault=fault,
             stream=episode.stream,
             origin=episode.info.get(LOG_ORIGIN),
         )
-        blame = getattr(monitor, "blame_", None)
-        reattribute_alarms(blame, episode.stream, trace.alarms, trace.attribution)
-        traces.append(trace)
+        before_blame = {row: judged.attribution[row].copy() for row in trace.alarms}
+        reattribute_alarms(blame, episode.stream, trace.alarms, judged.attribution)
+        traces.append(replace(trace, strong_shares=before_blame))
     return traces
+
+
+def recentred(episode: Episode, shift: Floats) -> Episode:
+    """Return an episode without a level shift (D,) that was acknowledged."""
+    if not shift.any():
+        return episode
+    return replace(episode, stream=(episode.stream - shift).astype(np.float32))
+
+
+def followed(trace: ScoredEpisode, following: FollowingThreshold) -> ScoredEpisode:
+    """Return an episode with its surprise relative to a threshold that follows, which it moves on."""
+    assert trace.attribution is not None
+    relative = following.relative(trace.surprise) * trace.threshold
+    factor = np.ones(len(trace))
+    usual = np.isfinite(relative) & (trace.surprise > 0)
+    np.divide(relative, trace.surprise, out=factor, where=usual)
+    strong_shares = {row: shares * factor[row] for row, shares in trace.strong_shares.items()}
+    return replace(
+        trace,
+        surprise=relative,
+        attribution=trace.attribution * factor[:, None],
+        strong_shares=strong_shares,
+        top_channel="",
+    )
 
 
 def excused_in(trace: ScoredEpisode) -> dict[str, int]:

@@ -31,6 +31,8 @@ from asm_gym.files import write_text, written_whole
 COPIED = ("task", "monitor", "kind", "severity", "seed", "onset")
 """Columns of ``results.parquet`` that are fields of a scored episode."""
 
+_LINKED = re.compile(r"<td>(incidents/[0-9]+\.csv)</td>")  # files beside a report
+
 _PAGE = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
 
 
@@ -76,7 +78,8 @@ def _table(table: Table) -> str:
         frame.set_index(table.headings[0]).rename_axis(None).rename_axis(columns=table.headings[0])
     )
     with pd.option_context("display.max_colwidth", None):
-        start, rest = frame.to_html(border=0).split("\n", 1)
+        html = _LINKED.sub(r'<td><a href="\1">\1</a></td>', frame.to_html(border=0))
+    start, rest = html.split("\n", 1)
     return f'<div class="scroll">{start}<caption>{escape(table.caption)}</caption>\n{rest}</div>'
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.detection.contact_limits import LEANS_S
+from asm_gym.detection.incidents import incidents_in
 from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.readings import spans
 
@@ -63,15 +64,18 @@ class ScoredEpisode:
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
     # (T,) surprise that raised no alarm, by the event that excused it: a knock, or a stop
     excused: Mapping[str, Floats] = field(default_factory=dict)
-    # (T, D) shares of the channels in the surprise, for figures alone
+    # (T, D) shares of the channels in the surprise, for figures and incidents alone
     attribution: Floats | None = None
     channels: tuple[str, ...] = ()  # D names
+    groups: tuple[str, ...] = ()  # D groups of the channels
     fault: NDArray[np.bool_] | None = None  # (T,) the ground truth, for figures alone
     overridden: NDArray[np.bool_] | None = None  # (T,) the guard acted, for figures alone
     stream: Floats | None = None  # (T, D) sensed values, where they are drawn
-    origin: float | None = (
-        None  # stamp of the first row, by the log's own clock; None without one [s]
-    )
+    # stamp of the first row, by the log's own clock; None without one [s]
+    origin: float | None = None
+    power: float = 1.0  # by which the detection pools the channels, for incidents
+    # by row, the shares (D,) of the channels in its surprise, before blame; of rows near the threshold or above
+    strong_shares: Mapping[int, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):
@@ -85,6 +89,15 @@ class ScoredEpisode:
 
     def __len__(self) -> int:
         return len(self.surprise)
+
+    def count_incidents(self, surprise: Floats) -> int:
+        """Count the incidents in a surprise (T',) of its first rows; where no shares are kept, all is one cause."""
+        shares_of: Callable[[int], Floats] | None = None
+        if self.attribution is not None or self.strong_shares:
+            shares_of = self.raw_shares
+        return incidents_in(
+            surprise, self.threshold, self.dt, shares_of=shares_of, power=self.power
+        )
 
     @property
     def condition(self) -> str:
@@ -166,6 +179,15 @@ class ScoredEpisode:
             return slice(0, len(self))
         end = self.onset + window_steps(window_s, self.dt)
         return slice(self.onset, min(end, len(self)))
+
+    def raw_shares(self, row: int) -> Floats:
+        """Return the shares (D,) of a row before blame; zeros where they were not kept."""
+        kept = self.strong_shares.get(row)
+        if kept is not None:
+            return kept
+        if self.attribution is not None:
+            return np.asarray(self.attribution[row])
+        return np.zeros_like(next(iter(self.strong_shares.values())))
 
     def at(self, threshold: float) -> ScoredEpisode:
         """Return the same surprise judged by another threshold."""

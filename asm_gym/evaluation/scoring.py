@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
+from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.detection.conformal import EPISODE, HOUR, conformal_episodes
+from asm_gym.detection.incidents import power_of
 from asm_gym.evaluation.comparison import BenchmarkResult, LeftOut, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
@@ -22,6 +25,7 @@ from asm_gym.evaluation.resampling import Calibration
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
 from asm_gym.monitors.calibration import AlarmRate
+from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.version import __version__
 
 HEALTHY_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
@@ -29,6 +33,7 @@ HEALTHY_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
 """Rooms and files of the package whose code decides what a monitor learns."""
 
+STRONG = 0.25  # share of the threshold from which on the shares of a row are kept
 AT_ONCE = 256  # episodes scored together: the attribution of more would fill the memory
 
 Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
@@ -213,6 +218,14 @@ def traces_of(
                 affected_channels=label.affected_channels,
                 outcome=InterventionOutcome(episode.success, contact_force=force),
                 excused=surprise.excused_by_event,
+                power=power_of(monitor),
+                strong_shares=strong_shares(surprise, threshold),
             )
             traces.append(trace.attributed(surprise.attribution, episode.spec.labels))
     return traces
+
+
+def strong_shares(surprise: Surprise, threshold: float) -> dict[int, NDArray[np.float32]]:
+    """Return the shares (D,) of the rows near a threshold or above, by row."""
+    rows = np.flatnonzero(rows_over(surprise.value, STRONG * threshold))
+    return {int(row): surprise.attribution[row].astype(np.float32) for row in rows}

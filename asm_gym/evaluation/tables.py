@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 from asm_gym.evaluation.statistics import Share
 
 Subject = TypeVar("Subject")
+FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
 
 
 @dataclass(frozen=True)
@@ -68,3 +69,10 @@ def percent(share: Share | None) -> str:
     if share is None or not share.n:
         return ""
     return f"{100 * share.value:.0f} %"
+
+
+def plain_cell(text: str) -> str:
+    """Return a cell of CSV that no spreadsheet takes for a formula: a name that looks like one is quoted."""
+    if text.startswith(tuple(FORMULA)):
+        return f"'{text}"
+    return text

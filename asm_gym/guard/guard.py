@@ -11,14 +11,17 @@ The state of the robots is one table, ``robot_table.ROBOT``. Each stage is enter
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.alarm_rule import FAULT_EVENT, KNOCK_EVENT
+from asm_gym.guard.acknowledgement import Acknowledgements
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.alarm_terms import BY_CAUSE, CONTACT, SURPRISE, AlarmTerms
 from asm_gym.guard.arbiter import Arbiter
@@ -47,7 +50,10 @@ from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator
 from asm_gym.guard.step_info import Outcome, RowReport
 from asm_gym.monitors import Monitor
+from asm_gym.monitors.expectation import LevelShift
 from asm_gym.policies.policy import Policy
+
+LOG = logging.getLogger("asm_gym.safety")
 
 ROW_MARKS = "failed", "refused", "out_of_range", "must_decide"  # fields that hold for one row alone
 
@@ -143,6 +149,7 @@ class Guard:
         )
 
         self.running = self._arbiter.running
+        self._acknowledgements = Acknowledgements(monitor, spec, facts.count)
         self._no_load = no_load(facts.count, facts.felt_size)
         self._warned: set[tuple[int, str]] = set()  # robots, and the part that failed
         self._nobody = np.zeros(facts.count, bool)  # never written to
@@ -186,6 +193,29 @@ class Guard:
         """Confirm that the alarms of the robots of ``which`` (n,) in these episodes were real."""
         self.table.records["confirmed"] |= which
 
+    def acknowledge(self, robot: int = 0, column: int | None = None) -> LevelShift:
+        """Take the level at which a channel in alarm is steady for its own from now on, and return the shift.
+
+        It ends with this guard; ``keep`` saves it. No other channel is silenced.
+
+        Args:
+            robot: its number.
+            column: of the channel; by default the one that the open incident points to.
+
+        Raises:
+            ValueError: no incident is open, or the channel is not steady at another level.
+        """
+        shift = self._acknowledgements.acknowledge(robot, self._validator.last(robot), column)
+        only = self._nobody.copy()
+        only[robot] = True
+        self._observer.forget(only)
+        LOG.info("acknowledged: %s", shift)
+        return shift
+
+    def keep(self, path: str | Path, robot: int = 0) -> None:
+        """Write the memory with the level shifts of a robot that were acknowledged, in a note."""
+        self._acknowledgements.save(path, robot)
+
     def begin(self, which: Mask | None = None) -> RowReport:
         """Begin new episodes of the robots of ``which`` (n,), all by default; return the empty report."""
         if which is None:
@@ -199,6 +229,7 @@ class Guard:
             self._validator,
             self._diagnostician,
             self._limits,
+            self._acknowledgements,
         ):
             part.begin(which)
         self._warned = {(robot, part) for robot, part in self._warned if not which[robot]}
@@ -295,6 +326,7 @@ class Guard:
         for robot, failure in row.failures.items():
             self._warn(robot, failure, "which counts as an alarm")
         if to_decide:
+            self._acknowledgements.note_alarms(self.table.records["over"], row.attribution)
             self._decide(row)
         self._prepare_next_step(row)
         report = self._report(row)
@@ -309,6 +341,7 @@ class Guard:
         """Write into the table what is known before the rows are judged."""
         records = self.table.records
         rows = np.array(sensed.rows, np.float32)  # a copy, in which stale senses are left out
+        self._acknowledgements.recentre(rows)
         self.table.rows = rows
         self.table.infos = sensed.infos
         self._mark_active(active)

@@ -38,6 +38,14 @@ class LiveEvent:
     # Wall clock, ISO 8601: when it happened, or by a clock of dates; empty if unknown.
     date: str = ""
     log: str = ""  # the recording; empty of a live source
+    incident: int | None = None  # its number, from 1
+    group: str = ""  # of the channel
+    sign: str = ""  # ``+`` or ``-``: where the channel is from what is expected; empty if unknown
+    sensed: float | None = None  # number of the channel [unit]
+    expected: float | None = None  # by all other senses; None if unknown [unit]
+    plus_minus: float | None = None  # standard deviation of what is expected [unit]
+    unit: str = ""
+    evidence: str = ""  # file with the rows around the incident, written five seconds later
 
     def __str__(self) -> str:
         if self.kind == SUMMARY:

@@ -8,7 +8,6 @@ come at another rate, and a source may die and come back.
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections import deque
@@ -16,18 +15,22 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import LATE, SURPRISING, TOGETHER_S, blamed, reason
+from asm_gym.data.alarm_reasons import LATE, SURPRISING, blamed
 from asm_gym.data.bridging import Bridge
 from asm_gym.data.live_rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
+from asm_gym.detection.following_threshold import FollowingThreshold
+from asm_gym.detection.incidents import AlarmRow, Incident, IncidentBook, power_of
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.guard import Guard
+from asm_gym.guard.incident_desk import IncidentDesk
 from asm_gym.guard.live_events import (
     ALARM,
     CLOCK,
@@ -39,6 +42,7 @@ from asm_gym.guard.live_events import (
     WATCHDOG,
     LiveEvent,
 )
+from asm_gym.guard.operator_orders import Orders
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.step_info import RowReport
@@ -67,6 +71,13 @@ class WatchSettings:
     clock: str = ""  # column of times; by default the first that has a clock's name
     silence_s: float = 2.0  # after which the numbers of one of several publishers are missing [s]
     schema: LogSchema | None = None  # how lines are read; by default that of the memory
+    evidence: Path | None = None  # folder for the rows around each incident
+    orders: Orders | None = None  # of a person: acknowledge or snooze
+    acknowledges: tuple[
+        str, ...
+    ] = ()  # channels whose level shifts are learned once they are steady
+    keep: Path | None = None  # file for the memory with the level shifts that were learned
+    following: FollowingThreshold | None = None  # the threshold that follows
 
 
 USUAL = WatchSettings()
@@ -104,6 +115,8 @@ def follow(
             if watch.rows:
                 watch.summarise()
             raise
+        finally:
+            watch.close()
     watch.summarise()
     return watch.alarms
 
@@ -134,7 +147,7 @@ class LiveWatch(Adapter):
         self._settings = settings
         self._spec = spec
         schema = settings.schema or LogSchema.kept_in(getattr(monitor, "about", {}), spec)
-        self._names = schema.names_in_logs
+        names = schema.names_in_logs
         self._reader = RowReader(schema, settings.clock, settings.silence_s)
         options = GuardOptions("monitor", contact_limits=None)
         self._guard = Guard(RobotFacts.unknown(spec), monitor, options, explains=False)
@@ -143,7 +156,9 @@ class LiveWatch(Adapter):
         self._stamp: float | None = None  # of the newest row, by the robot's own clock [s]
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
         self._unreadable_lines = 0
-        self._unreadable_at = -math.inf  # arrival of the newest unreadable line [s]
+        self._line_book = IncidentBook()  # of unreadable lines, by their arrival
+        self._book = IncidentBook(power_of(monitor))  # of all else, by the time of the rows
+        self._desk = IncidentDesk(monitor, self._guard, settings, names, self._note)
         self._blame = FollowedBlame(monitor)
         self._judge(np.zeros(spec.size), is_bridged=False)  # compiles
         self._begin()
@@ -153,10 +168,9 @@ class LiveWatch(Adapter):
         self._guard.begin()
         self._blame.begin()
         self._bridge = Bridge(self._settings.bridge_s, self._spec.dt, self._spec.size)
-        self._lost_before = 0  # rows lost before the newest one
-        self._cause = ""  # why surprise is over its threshold; empty where it is not
+        self._was_over = False  # the surprise of the newest row was over its threshold
         self._last_event = NO_EVENT  # of the newest row
-        self._last_rows = dict[str, int]()  # the last row over the threshold, by cause
+        self._desk.begin()
 
     def rows_of(self, lines: Iterable[str] | None) -> Iterator[tuple[Row, float]]:
         """Yield each row and its arrival [s], of a source and of the same opened anew."""
@@ -183,6 +197,7 @@ class LiveWatch(Adapter):
             if lines is not None:
                 self._reader.begin()
                 self._begin()
+                self._book.end_all()
                 self._note(f"the source is back after {time.monotonic() - start:.1f} s")
                 return lines
             time.sleep(min(RETRY_S, left_s))
@@ -207,12 +222,12 @@ class LiveWatch(Adapter):
         self.rows += 1
         if row.lost:
             self._pass_lost_rows(row.lost)
-        self._lost_before = row.lost
 
         report = self._judge(row.numbers, self._bridge.goes_over(np.isnan(row.numbers)))
         self._latencies.append(1e3 * (time.perf_counter() - arrival))
         self._check_watchdog()
         self.report_step([report], row)
+        self._desk.after_row(self._now, row, report, self._book)
 
     def _check_reading(self, row: Row, arrival: float) -> None:
         """Say what is wrong with the line, the clock or the rate."""
@@ -221,20 +236,19 @@ class LiveWatch(Adapter):
         if row.problem and not row.read:  # the line is no row, or came too late
             self._count_unreadable(row.problem, arrival)
         elif row.problem:  # the clock was set anew
-            self._alarm(f"{row.problem}: an alarm, and a new beginning", CLOCK)
+            self._alarm_once(f"{row.problem}: an alarm, and a new beginning", CLOCK)
             self._begin()
         elif row.change and row.read:  # rows come at another rate, and can be judged
             self._note(row.change)
         elif row.change:  # they cannot
-            self._alarm(f"{row.change}: they are not judged, an alarm", RATE)
+            self._alarm_once(f"{row.change}: they are not judged, an alarm", RATE)
             self._begin()
 
     def _count_unreadable(self, problem: str, arrival: float) -> None:
-        """Count a line that cannot be read; lines close together are one alarm."""
+        """Count a line that cannot be read."""
         self._unreadable_lines += 1
-        if arrival - self._unreadable_at > TOGETHER_S:
+        if self._line_book.note(UNREADABLE, arrival) is not None:
             self._alarm(f"{problem[:LONGEST_PROBLEM]}: an alarm", UNREADABLE)
-        self._unreadable_at = arrival
 
     def _pass_lost_rows(self, lost: int) -> None:
         """Go on over rows that did not come, as many as the bridge allows."""
@@ -248,9 +262,8 @@ class LiveWatch(Adapter):
         for _ in range(passed):
             self._judge(missing, is_bridged=True)
 
-        # A source that loses rows again and again is one alarm.
-        if is_alarm and not self._lost_before:
-            self._alarm(f"{counted(lost, 'row')} lost: an alarm ({LATE})", LATE)
+        if is_alarm:
+            self._alarm_once(f"{counted(lost, 'row')} lost: an alarm ({LATE})", LATE)
         self.rows += lost
 
     def _judge(self, numbers: NDArray[np.float64], is_bridged: bool) -> RowReport:
@@ -278,32 +291,52 @@ class LiveWatch(Adapter):
             self._report_event(EVENTS[report.robots["event"][0]])
 
     def _report_surprise(self, report: RowReport, numbers: NDArray[np.float64]) -> None:
-        """Raise an alarm where surprise is over its threshold for a cause that is new."""
+        """Raise an alarm where surprise over its threshold opens an incident."""
         robot = report.robots[0]
         shares = self._blame.shares(numbers, bool(robot["over"]), report.attribution[0])
-        if not robot["over"]:
-            self._cause = ""
+        follows = self._was_over
+        self._was_over = bool(robot["over"])
+        if not self._was_over:
             return
+        row = AlarmRow(
+            time=self._now,
+            numbers=numbers,
+            shares=report.attribution[0],
+            surprise=float(robot["surprise"]),
+            threshold=float(robot["threshold"]),
+            follows=follows,
+            column=None if follows else blamed(numbers, shares),
+        )
+        incident = self._book.follow(row)
+        if incident is not None:
+            self._alarm_surprise(incident, numbers)
 
-        excess = float(robot["surprise"] / robot["threshold"])
-        cause = self._cause or reason(numbers)
-        rows_since = self.rows - self._last_rows.get(cause, -math.inf)
-        if rows_since * self._spec.dt > TOGETHER_S:
-            self._alarm_surprise(cause, excess, blamed(numbers, shares))
-        self._cause = cause
-        self._last_rows[cause] = self.rows
-
-    def _alarm_surprise(self, cause: str, excess: float, column: int | None) -> None:
-        """Raise the alarm of a surprise of ``excess`` thresholds in a column of the row."""
+    def _alarm_surprise(self, incident: Incident, numbers: NDArray[np.float64]) -> None:
+        """Raise the alarm of an incident that a row opens."""
         latency_ms = self._latencies[-1]
-        text = f"{excess:.2f} thresholds  {latency_ms:.2f} ms after the row came"
-        if cause != SURPRISING:
-            text += f"  ({cause})"
-        channel = ""
-        if column is not None:
-            channel = self._names[column]
-            text = f"{channel}  {text}"
-        self._alarm(text, cause, channel=channel, thresholds=excess, latency_ms=latency_ms)
+        text = f"{incident.excess:.2f} thresholds  {latency_ms:.2f} ms after the row came"
+        if incident.reason != SURPRISING:
+            text += f"  ({incident.reason})"
+        details = self._desk.details(incident, numbers, self.alarms + 1)
+        if incident.column is not None:
+            text = f"{details.channel}  {text}{details.in_words}"
+        self._alarm(
+            text,
+            incident.reason,
+            thresholds=incident.excess,
+            latency_ms=latency_ms,
+            **details.fields,
+        )
+
+    def _alarm_once(self, text: str, reason: str) -> None:
+        """Raise an alarm that points to no channel, unless it belongs to an incident that is open."""
+        if self._book.note(reason, self._now) is not None:
+            self._alarm(text, reason)
+
+    @property
+    def _now(self) -> float:
+        """Time of the rows up to now [s]."""
+        return self.rows * self._spec.dt
 
     def _report_event(self, event: str) -> None:
         """Note a knock or a stop when it begins."""
@@ -314,19 +347,23 @@ class LiveWatch(Adapter):
     def _alarm(self, text: str, reason: str, **details: Any) -> None:
         """Count and say an alarm."""
         self.alarms += 1
-        self._note(text, kind=ALARM, reason=reason, **details)
+        self._note(text, kind=ALARM, reason=reason, incident=self.alarms, **details)
 
     def _note(self, text: str, kind: str = NOTE, **details: Any) -> None:
         """Say an event of the newest row."""
         event = LiveEvent(
             kind=kind,
-            time=self.rows * self._spec.dt,
+            time=self._now,
             text=text,
             stamp=self._stamp,
             date=datetime.now(UTC).isoformat(timespec="milliseconds"),
             **details,
         )
         self._say(event)
+
+    def close(self) -> None:
+        """Write what is left to write."""
+        self._desk.close()
 
     def summarise(self) -> None:
         """Say how many rows and alarms there were, and how long a row took.

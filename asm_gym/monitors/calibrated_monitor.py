@@ -25,6 +25,7 @@ from asm_gym.detection.healthy_ranges import healthy_ranges
 from asm_gym.exceptions import NotFitted
 from asm_gym.monitors.calibration import (
     AlarmRate,
+    blocks_of_incidents,
     ceiling_episodes,
     require_sight,
     with_ceilings,
@@ -250,8 +251,8 @@ class CalibratedMonitor:
             episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an
                 hour.
             false_alarm_rate: largest probability of an alarm in a nominal episode, in (0, 1).
-            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. An
-                alarm that persists, or returns within a minute of the same episode, counts once.
+            false_alarms_per_hour: largest mean number of incidents in an hour of nominal episodes
+                (``detection.incidents``).
             each: task or policy of each episode, to keep the promise in each of them.
 
         Raises:
@@ -300,12 +301,15 @@ class CalibratedMonitor:
         self, episodes: Sequence[Episode], rate: AlarmRate, groups: Sequence[str]
     ) -> None:
         """Set the threshold for a rate of alarms in these episodes, and in each of their groups."""
-        values = [surprise.value for surprise in self.score_episodes(episodes)]
-        self.threshold_ = rate.threshold_of(values, self.spec.dt, groups)
+        surprises = self.score_episodes(episodes)
+        values = [surprise.value for surprise in surprises]
+        blocks = Blocks.of(values, self.spec.dt, groups)
+        blocks = blocks_of_incidents(blocks, surprises, self, groups)
+        self.threshold_ = rate.threshold_of(values, blocks, groups)
         require_sight(self.detection, self.model.error_columns, self.spec, self.threshold_)
         self.promised_ = rate.per
         self.maxima_ = np.array([value.max() for value in values])
-        self.blocks_ = Blocks.of(values, self.spec.dt, groups)
+        self.blocks_ = blocks
 
     def _keep_healthy_ranges(self, episodes: Sequence[Episode]) -> None:
         """Keep the forces, speeds, motion and commands of healthy episodes."""

@@ -24,6 +24,8 @@ from asm_gym.detection.conformal import (
     hourly_threshold,
 )
 from asm_gym.detection.evidence import FEWEST_EPISODES
+from asm_gym.detection.incidents import incidents_in, power_of
+from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.training_data import shortened
 from asm_gym.spec import StreamSpec
@@ -90,17 +92,59 @@ class AlarmRate(NamedTuple):
         assert blocks is not None
         return hourly_threshold(blocks, self.rate)
 
-    def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
-        """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups."""
+    def threshold_of(self, values: Sequence[Array], blocks: Blocks, each: Sequence[str]) -> float:
+        """Return the threshold from the values (T,) of nominal episodes, the greatest of its groups.
+
+        Args:
+            values: of each episode.
+            blocks: of these values, which hold the groups too.
+            each: group of every episode; empty for one group.
+        """
         maxima = np.array([value.max() for value in values])
-        thresholds = [self.threshold(maxima, Blocks.of(values, dt, each))]
-        for name in dict.fromkeys(each):
-            own_values = [value for value, group in zip(values, each, strict=True) if group == name]
+        thresholds = [self.threshold(maxima, blocks)]
+        names = list(dict.fromkeys(each))
+        of_groups = [blocks]
+        if blocks.group.size:
+            of_groups = blocks.groups
+        for name, own_blocks in zip(names, of_groups, strict=False):
+            own = maxima[np.array(each) == name]
             try:
-                thresholds.append(self.threshold_of(own_values, dt))
+                thresholds.append(self.threshold(own, own_blocks))
             except ValueError as error:
                 raise ValueError(f"{name} by itself: {error}") from None
         return max(thresholds)
+
+
+def blocks_of_incidents(
+    blocks: Blocks, surprises: Sequence[Surprise], monitor: CalibratedMonitor, each: Sequence[str]
+) -> Blocks:
+    """Return the blocks of nominal episodes, with all incidents in them.
+
+    Args:
+        blocks: of the episodes.
+        surprises: of the episodes.
+        monitor: that was surprised.
+        each: group of every episode; empty for one group.
+    """
+    power = power_of(monitor)
+    names = list(dict.fromkeys(each))
+
+    def count(threshold: float, group: int) -> int:
+        """Count the incidents in a group of episodes at a threshold."""
+        found = 0
+        for n, surprise in enumerate(surprises):
+            if names and each[n] != names[group]:
+                continue
+            found += incidents_in(
+                surprise.value,
+                threshold,
+                monitor.spec.dt,
+                shares_of=surprise.attribution.__getitem__,
+                power=power,
+            )
+        return found
+
+    return blocks.with_incidents(count)
 
 
 def blind_to(

@@ -26,7 +26,7 @@ from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.training_selection import SHORTEST_PART_S, normal_episodes, pieces
 from asm_gym.detection import conformal_episodes
-from asm_gym.detection.conformal import EPISODE
+from asm_gym.detection.conformal import EPISODE, hourly_promise
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
@@ -393,7 +393,8 @@ def summary_of_threshold(args: Args, monitor: Any, calibration_episodes: int) ->
             f"{(usual - 1) / CALIBRATION_SHARE:g} promise one in {usual}."
         )
 
-    expected, at_most = monitor.promise.hourly(hours)
+    in_incidents = hourly_promise(monitor.blocks_, monitor.threshold, used)
+    expected, at_most = in_incidents.hourly(hours)
     line = (
         f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an "
         f"hour, at most {at_most:.3g} with 95 % confidence; other motion raises more."

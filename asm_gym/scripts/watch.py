@@ -15,52 +15,47 @@ import csv
 import io
 import math
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 from rich.console import Console
 
-from asm_gym.data.alarm_reasons import SURPRISING
-from asm_gym.data.bridging import bridge_of, bridged
+from asm_gym.data.bridging import bridge_of
 from asm_gym.data.dds_topics import publisher
 from asm_gym.data.live_sources import lines_from, live_source
-from asm_gym.data.logs import Log, read_logs
+from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema import LogSchema
+from asm_gym.detection.conformal import hourly_promise
+from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.evaluation import recorded_alarms
-from asm_gym.evaluation.recorded_alarms import HEADINGS, Alarm
-from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.tables import Table
+from asm_gym.evaluation.recorded_alarms import HEADINGS
+from asm_gym.evaluation.tables import Table, plain_cell
 from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
 from asm_gym.guard.alarm_outlets import AlarmOutlets, LineWriter, say_aside
-from asm_gym.guard.live_events import (
-    ALARM,
-    NOTE,
-    SUMMARY,
-    LiveEvent,
-    hold_by_hook,
-    run_hook,
-)
-from asm_gym.guard.live_watch import WatchSettings, counted, follow
+from asm_gym.guard.live_events import LiveEvent, hold_by_hook, run_hook
+from asm_gym.guard.live_watch import WatchSettings, follow
+from asm_gym.guard.operator_orders import Orders, taken_from, without_orders
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, REFUSED, option, origin, run
 from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
+from asm_gym.scripts.recording_review import Review, say_events, say_table
 from asm_gym.validation import check_number
 
+INCIDENTS = "incidents"  # folder of the rows around alarms
 AT_ONCE = 64  # episodes scored side by side
-LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy")  # options of a live source
+# Options of a live source.
+LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy", "acknowledge", "keep")
 RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")  # options of a recording
-MOST_PRINTED = 20  # alarms of a recording; the file holds them all
-DRAWN_EPISODES = 4  # episodes in the report, the most surprising ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +67,7 @@ class Args(LogOptions):
     monitor: Path = option(metavar="FILE.asm")
     """The memory, written by asm-gym fit."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
-    """Folder of the table, the figures and the report of a recording."""
+    """Folder of the table, the figures and the report of a recording, and of the rows around each alarm."""
     bridge: float | None = option(
         None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS"
     )
@@ -82,7 +77,8 @@ class Args(LogOptions):
     until_alarm: bool = False
     """End at the first alarm of a live source, with exit code 1: asm-gym watch ... --until-alarm || stop."""
     json: bool = False
-    """Print events as JSON lines: kind, time, text, stamp, date, log, reason, channel, thresholds, latency_ms."""
+    """Print events as JSON lines: kind, time, text, stamp, date, log, reason, channel, thresholds, latency_ms,
+    incident, group, sign, sensed, expected, plus_minus, unit, evidence."""
     hook: str | None = option(None, metavar="COMMAND")
     """Shell command to run at every alarm of a live source; it gets the alarm as JSON on its standard input."""
     topic: str = option("", metavar="TOPIC")
@@ -95,43 +91,20 @@ class Args(LogOptions):
     """Process id of the policy; the watchdog treats its death as an alarm."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
     """Time without a row after which a live source counts as dead, which is an alarm."""
-
-
-@dataclass
-class Review:
-    """Alarms in the recordings that were scored up to now."""
-
-    alarms: list[Alarm] = field(default_factory=list)
-    # the ``DRAWN_EPISODES`` with the greatest surprise, the greatest first
-    worst: list[ScoredEpisode] = field(default_factory=list)
-    episodes: int = 0
-    excused: Counter[str] = field(default_factory=Counter)  # events that were no alarms
-    bridged_rows: int = 0
-
-    def add(self, logs: Sequence[Log], monitor: Any, bridge: float) -> None:
-        """Score some recordings; gaps of at most ``bridge`` [s] are not judged."""
-        traces = recorded_alarms.traces_of(logs, monitor, bridge)
-        for log, trace in zip(logs, traces, strict=True):
-            is_bridged = bridged(log.episode.stream, monitor.spec.dt, bridge)  # (T,)
-            self.bridged_rows += int(is_bridged.sum())
-            self.alarms += recorded_alarms.alarms_of(trace)
-            self.excused.update(recorded_alarms.excused_in(trace))
-            self.worst.append(trace)
-        self.worst.sort(key=lambda trace: -recorded_alarms.sensed_peak(trace))
-        del self.worst[DRAWN_EPISODES:]
-        self.episodes += len(logs)
-
-    def summary(self) -> str:
-        """Return how many alarms there were, and how many events that were none."""
-        logs = len({alarm.log for alarm in self.alarms})
-        parts = [f"{counted(len(self.alarms), 'alarm')} in {logs} of {self.episodes} episodes"]
-        parts += [counted(count, event) for event, count in self.excused.items() if count]
-        return ", ".join(parts)
+    acknowledge: tuple[str, ...] = option((), metavar="CHANNEL")
+    """Channels of a live source, or all: the level shift of an open alarm is learned as soon as it is steady. By hand:
+    the key a in a terminal, or the line 'acknowledge [ALARM]' on standard input; s, or 'snooze [SECONDS [ALARM]]',
+    keeps an alarm silent for a time, 600 s by default. Both end with the run."""
+    keep: Path | None = option(None, metavar="FILE.asm")
+    """File to write the memory to, with the level shifts that were acknowledged."""
+    follow_threshold: Path | None = option(None, metavar="FILE.json")
+    """Let the threshold follow slow change, a step a minute; the file keeps it from run to run."""
 
 
 def review(args: Args, monitor: Any, console: Console) -> int:
     """Score a recording, write its alarms and a report, and print the alarms."""
-    reviewed = Review()
+    following = following_of(args, monitor)
+    reviewed = Review(following=following)
     bridge = bridge_of(args.bridge, monitor.spec.dt)
     writable(args.out / "alarms.csv")
     progress_console = console
@@ -140,11 +113,13 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     with stage("watching", progress_console) as progress, noted() as notes:
         logs = iter(read_logs(args.source, args.hints(), schema_of(args, monitor)))
         while group := list(islice(logs, AT_ONCE)):  # a folder may be larger than memory
-            reviewed.add(group, monitor, bridge)
+            reviewed.add(group, monitor, bridge, args.out / INCIDENTS)
             progress(reviewed.episodes, reviewed.episodes)
 
+    if following is not None:
+        following.save()
     table = io.StringIO(newline="")
-    rows = [map(recorded_alarms.plain_cell, alarm.cells()) for alarm in reviewed.alarms]
+    rows = [map(plain_cell, alarm.cells()) for alarm in reviewed.alarms]
     csv.writer(table).writerows([HEADINGS, *rows])
     write_text(args.out / "alarms.csv", table.getvalue())
     written = write_figures_and_report(args, reviewed)
@@ -157,56 +132,6 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     if reviewed.alarms:
         return exit_code_of_reading(notes, BAD_NEWS)
     return exit_code_of_reading(notes)
-
-
-def say_events(reviewed: Review, notes: Sequence[str], say: Callable[[str], None]) -> None:
-    """Print notes, alarms and the summary of recordings as JSON lines."""
-    for line in notes:
-        say(LiveEvent(kind=NOTE, time=0.0, text=line).to_json())
-    for alarm in reviewed.alarms:
-        say(event_of(alarm).to_json())
-    say(LiveEvent(kind=SUMMARY, time=0.0, text=reviewed.summary()).to_json())
-
-
-def event_of(alarm: Alarm) -> LiveEvent:
-    """Return an alarm of a recording as the event that a live watch makes of it."""
-    return LiveEvent(
-        kind=ALARM,
-        time=alarm.start,
-        text=f"{alarm.excess:.2f} thresholds up to {alarm.end:.3f} s",
-        reason=alarm.why,
-        channel=alarm.channel,
-        thresholds=alarm.excess,
-        stamp=alarm.stamp,
-        date=alarm.date,
-        log=alarm.log,
-    )
-
-
-def say_table(
-    reviewed: Review, notes: Sequence[str], bridge: float, say: Callable[[str], None]
-) -> None:
-    """Print notes, the summary and the largest alarms of recordings, missing data last."""
-    for line in notes:
-        say(f"Note: {line}.")
-    if reviewed.bridged_rows:
-        say(
-            f"Bridged {reviewed.bridged_rows} rows that lack a number, in gaps of at most "
-            f"{bridge:.3g} s: they are not judged."
-        )
-    alarms = sorted(reviewed.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
-    printed = alarms[:MOST_PRINTED]
-    summary = reviewed.summary()
-    if len(printed) < len(alarms):
-        summary += f"; the {MOST_PRINTED} largest:"
-    say(summary)
-    if not printed:
-        return
-    width = max(len(alarm.channel) for alarm in printed)
-    lines_of_cells = [HEADINGS, *(alarm.cells() for alarm in printed)]
-    for cells in lines_of_cells:
-        log, start, end, channel, why, excess, _ = cells
-        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
 
 
 def schema_of(args: Args, monitor: Any) -> LogSchema:
@@ -234,9 +159,10 @@ def write_figures_and_report(args: Args, reviewed: Review) -> str:
     stream = figures.stream_figure(reviewed.worst[0])
     figures.save(surprise, args.out / "surprise.png")
     figures.save(stream, args.out / "stream.png")
-    tables = []
+    tables = [recorded_alarms.by_hour(reviewed.alarms, reviewed.hours)]
     if reviewed.alarms:
-        tables = [Table("Alarms", HEADINGS, [alarm.cells() for alarm in reviewed.alarms])]
+        rows = [alarm.cells() for alarm in reviewed.alarms]
+        tables.append(Table("Alarms", HEADINGS, rows))
     report = args.out / "report.html"
     write_report(
         report,
@@ -282,10 +208,15 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
     reopen: Callable[[float], Iterator[str]] | None = None
     if returns:
         reopen = open_lines
-    lines = open_lines(max(args.wait, args.silence))
+    orders: Orders = Queue()
+    lines: Iterable[str] = open_lines(max(args.wait, args.silence))
+    own_input = sys.stdin
+    if args.source == "-":
+        lines = without_orders(lines, orders)
+        own_input = None
     beat = None
     outlets = outlets_of(args, console)
-    with _watchdog(args, monitor.spec.dt) as watchdog:
+    with _watchdog(args, monitor.spec.dt) as watchdog, taken_from(own_input, orders):
         announcement = f"watching {args.source}"
         if watchdog is not None:
             announcement += ", guarded by a watchdog"
@@ -300,6 +231,11 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
             clock=args.clock,
             silence_s=args.silence,
             schema=schema_of(args, monitor),
+            evidence=args.out / INCIDENTS,
+            orders=orders,
+            acknowledges=args.acknowledge,
+            keep=args.keep,
+            following=following_of(args, monitor),
         )
         try:
             alarms = follow(lines, monitor, outlets.say, settings)
@@ -310,6 +246,16 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
     if alarms:
         return BAD_NEWS
     return DONE
+
+
+def following_of(args: Args, monitor: Any) -> FollowingThreshold | None:
+    """Return the threshold that follows, where the options ask for it."""
+    if args.follow_threshold is None:
+        return None
+    promise = hourly_promise(monitor.blocks_, monitor.threshold, len(monitor.maxima_))
+    return FollowingThreshold.open(
+        args.follow_threshold, monitor.threshold, per_hour=promise.rate, dt=monitor.spec.dt
+    )
 
 
 def outlets_of(args: Args, console: Console) -> AlarmOutlets:

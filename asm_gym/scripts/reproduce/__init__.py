@@ -16,6 +16,7 @@ STUDIES = {
     "panda": "one network learns six skills of the Panda without labels",
     "harm": "harm that the guard avoids, and success that it keeps",
     "chunks": "impacts predicted from chunks of actions, and false predictions",
+    "day": "a simulated day of an arm: incidents against ten events",
     "hours": "false alarms an hour of a shipped memory; needs a corpus",
     "real_arms": "faults added to recordings of real arms (to download)",
 }

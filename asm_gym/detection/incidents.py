@@ -1,0 +1,301 @@
+"""Incidents: one cause counts once. Live watch, reports, counts by the hour and promises go by this definition.
+
+    strength    r_i = (a_i s^(p-1))^(1/p) / q      of channel i, in thresholds; (Σ r_i^p)^(1/p) = s/q
+    opens       row in alarm, and no incident of a minute before explains it
+    explains    (Σ r_i^p)^(1/p) <= max(1, 2 m) over the channels i of no open incident
+    ends        a minute without a row of its own; of a snoozed one, when that time is over
+
+s is surprise, q its threshold, a_i the share of channel i, and p how the detection pools. A row in ``SETTLING_S`` from
+an incident's start adds its channels to it; m is the greatest strength in channels that were added, so that a
+fault which spreads is one incident, and a fault elsewhere opens another at once.
+
+Of rows with missing or other broken numbers, each reason is a cause, and its channels are those numbers. Surprise in
+the rows that follow comes from the gap and belongs to it. The sign of an incident is noted and divides none: the error
+of a channel that moves changes its sign all the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.alarm_reasons import SURPRISING, blamed, reason
+from asm_gym.detection.alarm_rule import MINUTE, alarms_in, rows_over
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+SharesOf = Callable[[int], Numbers]
+
+SETTLING_S = 2.0  # in which an incident spreads over the channels it touches [s]
+SPREAD = 2.0  # a channel of no incident may be as strong as this times those that were added
+FADING_S = 10.0  # in which surprise fades once the cause is acknowledged [s]
+TOUCHED = 0.5  # least strength of a channel that an incident touches, in thresholds
+
+
+@dataclass(eq=False, slots=True)
+class Incident:
+    """An alarm with all that has the same cause."""
+
+    reason: str  # of ``asm_gym.data.alarm_reasons``
+    column: int | None  # that its first row points to; None where a whole row was missing
+    start: float  # of its first row [s]
+    last: float  # of its last row up to now [s]
+    known: Mask  # (D,) its channels
+    excess: float  # greatest surprise, in thresholds
+    spread: float = 0.0  # m
+    settled: float = 0.0  # until then it spreads [s]
+    gap: float = -math.inf  # its latest row with numbers that are missing or not finite [s]
+    snoozed: float | None = None  # until then it stays open, whatever comes [s]
+
+    def is_open(self, time: float) -> bool:
+        """Return whether a row at this time [s] may still belong to it."""
+        if self.snoozed is not None:
+            return time <= self.snoozed
+        return time - self.last <= MINUTE
+
+    def settles(self, time: float) -> bool:
+        """Return whether it still spreads at this time [s]."""
+        return time <= self.settled
+
+    def snooze(self, time: float, seconds: float) -> None:
+        """Keep it open, and so silent, for so many seconds from a time [s] on."""
+        self.snoozed = time + seconds
+
+    def acknowledge(self, time: float) -> None:
+        """Take what follows at once as its end; after that, the same cause opens another."""
+        self.settled = time + SETTLING_S
+        self.snoozed = time + FADING_S
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmRow:
+    """A row in alarm."""
+
+    time: float  # [s]
+    numbers: Numbers  # (D,) as they were sensed
+    shares: Floats  # (D,) of its surprise
+    surprise: float
+    threshold: float
+    follows: bool = False  # the row before was in alarm too
+    column: int | None = None  # that blame points to; None where it was not asked
+
+
+class IncidentBook:
+    """Assign rows in alarm to incidents.
+
+    Args:
+        power: p, how the detection pools its channels; 1 for a sum.
+
+    Attributes:
+        incidents: all of them, in the order of their starts.
+    """
+
+    def __init__(self, power: float = 1.0) -> None:
+        self.incidents: list[Incident] = []
+        self._power = power
+        self._open: list[Incident] = []
+        self._is_after_gap = False  # every row in alarm since a gap has followed another
+
+    def open_at(self, time: float) -> list[Incident]:
+        """Return the incidents that are open at this time [s]."""
+        self._open = [incident for incident in self._open if incident.is_open(time)]
+        return self._open
+
+    def end_all(self) -> None:
+        """End all incidents: whatever comes next opens another."""
+        self._open = []
+
+    def follow(self, row: AlarmRow) -> Incident | None:
+        """Take up a row in alarm; return the incident that it opens, None where it belongs to one."""
+        why = reason(row.numbers)
+        excess = float(row.surprise / row.threshold)
+        if why != SURPRISING:
+            return self._follow_broken(row, why, excess)
+
+        strengths = strengths_of(row, self._power)
+        open_now = self.open_at(row.time)
+        gaps = [i for i in open_now if row.time - i.gap <= SETTLING_S]
+        if row.follows and self._is_after_gap and gaps:
+            return None  # the surprise of a gap
+        self._is_after_gap = False
+        surprising = [i for i in open_now if i.reason == SURPRISING]
+        if not surprising:
+            column = row.column
+            if column is None:
+                column = blamed(row.numbers, row.shares)
+            return self._opened(row, SURPRISING, column, strengths > TOUCHED, excess)
+
+        known = np.logical_or.reduce([i.known for i in surprising])
+        rest = np.where(known, 0.0, strengths)
+        allowed = max(1.0, *(SPREAD * i.spread for i in surprising))
+        young = [i for i in surprising if i.settles(row.time)]
+        if not young and pooled(rest, self._power) > allowed:
+            touched = (rest > TOUCHED) | (rest == rest.max())
+            column = row.column
+            if column is None or known[column]:
+                column = int(np.argmax(rest))
+            return self._opened(row, SURPRISING, column, touched, excess)
+
+        owner = max(surprising, key=lambda i: pooled(strengths[i.known], self._power))
+        if young:
+            _spread(young[-1], strengths, known)
+        for incident in surprising:
+            own_strength = pooled(strengths[incident.known], self._power)
+            if incident is owner or own_strength > 1.0:
+                incident.last = row.time
+                incident.excess = max(incident.excess, min(own_strength, excess))
+        return None
+
+    def note(self, why: str, time: float) -> Incident | None:
+        """Take up what is wrong with no channel, such as a line that cannot be read, as ``follow`` does a row."""
+        for incident in self.open_at(time):
+            if incident.reason == why:
+                incident.last = time
+                return None
+        return self._add(why, None, time, np.zeros(0, np.bool_), math.inf)
+
+    def _follow_broken(self, row: AlarmRow, why: str, excess: float) -> Incident | None:
+        """Take up a row with numbers that are missing or not finite."""
+        self._is_after_gap = True
+        broken = ~np.isfinite(row.numbers)
+        same = [i for i in self.open_at(row.time) if i.reason == why]
+        for incident in same:
+            if (broken & incident.known).any() or incident.settles(row.time):
+                incident.last = row.time
+                incident.gap = row.time
+        if any(i.settles(row.time) for i in same):
+            same[-1].known |= broken
+        elif not same or (broken & ~np.logical_or.reduce([i.known for i in same])).any():
+            for incident in same:
+                broken = broken & ~incident.known
+            column = None
+            if not broken.all():
+                column = int(np.argmax(broken))
+            opened = self._opened(row, why, column, broken, excess)
+            opened.gap = row.time
+            return opened
+        return None
+
+    def _opened(
+        self, row: AlarmRow, why: str, column: int | None, known: Mask, excess: float
+    ) -> Incident:
+        """Open an incident by its first row."""
+        known = known.copy()
+        if column is not None:
+            known[column] = True
+        return self._add(why, column, row.time, known, excess)
+
+    def _add(
+        self, why: str, column: int | None, time: float, known: Mask, excess: float
+    ) -> Incident:
+        """Keep a new incident."""
+        incident = Incident(
+            reason=why,
+            column=column,
+            start=time,
+            last=time,
+            known=known,
+            excess=excess,
+            settled=time + SETTLING_S,
+        )
+        self.incidents.append(incident)
+        self._open.append(incident)
+        return incident
+
+
+def _spread(incident: Incident, strengths: Floats, known: Mask) -> None:
+    """Add the channels of a row, of these strengths (D,), to an incident that settles."""
+    incident.known |= (strengths > TOUCHED) & ~known
+    others = incident.known.copy()
+    if incident.column is not None:
+        others[incident.column] = False
+    if others.any():
+        incident.spread = max(incident.spread, float(strengths[others].max()))
+
+
+def strengths_of(row: AlarmRow, power: float) -> Floats:
+    """Return r (D,) of a row in alarm."""
+    shares = np.maximum(np.nan_to_num(row.shares, nan=0.0), 0.0)
+    if not math.isfinite(row.surprise):
+        return np.where(np.isfinite(shares), 0.0, np.inf)
+    strengths: Floats = (shares / row.surprise) ** (1.0 / power) * (row.surprise / row.threshold)
+    return strengths
+
+
+def pooled(strengths: Floats, power: float) -> float:
+    """Return (Σ r_i^p)^(1/p); 0 of none."""
+    greatest = float(strengths.max(initial=0.0))
+    if not 0.0 < greatest < math.inf:
+        return greatest
+    return greatest * float(((strengths / greatest) ** power).sum()) ** (1.0 / power)
+
+
+def power_of(monitor: object) -> float:
+    """Return p of a monitor's detection."""
+    return float(getattr(getattr(monitor, "detection", None), "power", 1.0))
+
+
+def rows_of_alarm(
+    surprise: Numbers,
+    shares_of: SharesOf,
+    stream: Numbers,
+    threshold: float,
+    dt: float,
+    blame_of: Callable[[int], int | None] = lambda row: None,
+) -> Iterator[AlarmRow]:
+    """Yield the rows in alarm of an episode.
+
+    Args:
+        surprise: (T,).
+        shares_of: returns the shares (D,) of the numbers of a row in its surprise, by the index of the row.
+        stream: (T, D) as it was sensed.
+        threshold: of surprise.
+        dt: period of the rows [s].
+        blame_of: returns the column that blame points to in a row; None where it was not asked.
+    """
+    over = rows_over(surprise, threshold)
+    for index in np.flatnonzero(over):
+        yield AlarmRow(
+            time=float((index + 1) * dt),
+            numbers=stream[index],
+            shares=np.asarray(shares_of(int(index)), np.float64),
+            surprise=float(surprise[index]),
+            threshold=threshold,
+            follows=bool(index and over[index - 1]),
+            column=blame_of(int(index)),
+        )
+
+
+def incidents_in(
+    surprise: Numbers,
+    threshold: float,
+    dt: float,
+    shares_of: SharesOf | None = None,
+    power: float = 1.0,
+) -> int:
+    """Count the incidents in the surprise (T,) of an episode.
+
+    Args:
+        surprise: (T,).
+        threshold: of surprise.
+        dt: period of the rows [s].
+        shares_of: as for ``rows_of_alarm``; None where shares are not kept, and all is one cause.
+        power: p of the detection.
+    """
+    if shares_of is None:
+        return alarms_in(surprise, threshold, dt)
+    book = IncidentBook(power)
+    over = rows_over(surprise, threshold)
+    for index in np.flatnonzero(over):
+        shares = np.asarray(shares_of(int(index)), np.float64)
+        numbers = np.where(np.isfinite(shares), 0.0, np.nan)
+        time = float((index + 1) * dt)
+        follows = bool(index and over[index - 1])
+        book.follow(AlarmRow(time, numbers, shares, float(surprise[index]), threshold, follows))
+    return len(book.incidents)
