@@ -101,12 +101,17 @@ class Tail(NamedTuple):
         cls,
         maxima: Array,
         expected: float,
+        blocks: int | None = None,
     ) -> Tail | None:
-        """Return the tail of maxima (n,), ``expected`` of which may exceed a threshold; None where they are counted."""
-        if len(maxima) < FEWEST_IN_TAIL or expected >= ENOUGH:
+        """Return the tail of maxima (n,), ``expected`` of which may exceed a threshold; None where they are counted.
+
+        With ``blocks``, its size goes by so many; other maxima are of further incidents in them.
+        """
+        count = blocks or len(maxima)
+        if count < FEWEST_IN_TAIL or expected >= ENOUGH:
             return None
         values = np.sort(maxima)
-        size = len(values) // MAXIMA_PER_ONE_IN_TAIL
+        size = count // MAXIMA_PER_ONE_IN_TAIL
         lowest = float(values[-size - 1])
         if not 0.0 < lowest < values[-1] < np.inf:
             return None
@@ -155,8 +160,9 @@ class Promise(NamedTuple):
         cls,
         maxima: Array,
         threshold: float,
+        blocks: int | None = None,
     ) -> Self:
-        """Return the promise by the episode, from the maxima (n,) of nominal ones."""
+        """Return the promise by the episode, from the maxima (n,) of nominal ones; ``blocks`` as of ``Tail.of``."""
         episodes = len(maxima)
         beyond = int(rows_over(maxima, threshold).sum())
         at_most = 1.0
@@ -164,7 +170,7 @@ class Promise(NamedTuple):
             at_most = float(betaincinv(beyond + 1, episodes - beyond, CONFIDENCE))
 
         rate = (beyond + 1) / (episodes + 1)
-        tail = Tail.of(maxima, expected=0.0)  # whatever the rate was
+        tail = Tail.of(maxima, expected=0.0, blocks=blocks)  # whatever the rate was
         was_counted = threshold in maxima  # a threshold that is counted is one of the maxima
         modelled = tail is not None and threshold > tail.lowest and not was_counted
         if tail is not None and modelled:
@@ -268,6 +274,11 @@ class Blocks(NamedTuple):
         return [Blocks(maxima=self.maxima[mask], hours=self.hours[mask]) for mask in masks]
 
     @property
+    def timed(self) -> int:
+        """How many blocks there are, further incidents in them aside."""
+        return int((self.hours > 0).sum())
+
+    @property
     def total(self) -> float:
         """Total duration [h]."""
         return float(self.hours.sum())
@@ -303,7 +314,7 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
         return max(hourly_threshold(group, rate) for group in blocks.groups)
     check_hours(rate, blocks.total)
     expected = rate * blocks.total
-    tail = Tail.of(blocks.maxima, expected)
+    tail = Tail.of(blocks.maxima, expected, blocks.timed)
     if tail is not None:
         return tail.threshold(expected)
     allowed = math.floor(expected + ROUNDING) - 1  # blocks that may exceed it
@@ -323,7 +334,7 @@ def hourly_promise(
         worst = max(promises, key=lambda promise: promise.rate)
         return worst._replace(hours=blocks.total)
 
-    by_block = Promise.of(blocks.maxima, threshold)
+    by_block = Promise.of(blocks.maxima, threshold, blocks.timed)
     count = len(blocks.maxima)
     blocks_judged = count + 1  # with a fresh one
     if by_block.modelled:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -56,6 +56,13 @@ SPEC = StreamSpec(
     dt=EVERY * CONTROL_PERIOD_S,
     source="table",
 )
+# A small memory learns such repeated work in a minute.
+SMALL: dict[str, Any] = {
+    "dynamics": "traces",
+    "hidden_size": 64,
+    "association_size": 160,
+    "epochs": 10,
+}
 FORCE = SPEC.slices["force"].start
 WIDTH = SPEC.slices["width"].start
 TORQUE = SPEC.slices["tau"].start
@@ -168,7 +175,7 @@ def learned(config: Config) -> NeuralASM:
     """Return a memory of usual work, with its promise by the hour."""
     fitting = [recording(10_000 + n) for n in range(config.logs)]
     calibration = [recording(20_000 + n) for n in range(config.calibration)]
-    memory = NeuralASM(SPEC, dynamics="traces", seed=config.seed).fit(fitting)
+    memory = NeuralASM(SPEC, **SMALL, seed=config.seed).fit(fitting)
     return memory.calibrate(calibration, false_alarms_per_hour=config.per_hour)
 
 
