@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asm_gym.detection.alarm_rule import MINUTE, alarms_in
@@ -106,6 +106,7 @@ def test_strengths_of_channels_pool_to_the_surprise_in_thresholds():
     assert pooled(strengths, POWER) == pytest.approx(each.surprise / each.threshold)
 
 
+@settings(deadline=None, max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 0.999))
 def test_with_one_channel_an_incident_is_an_alarm_counted_by_the_minute(seed, quantile):
     rng = np.random.default_rng(seed)
