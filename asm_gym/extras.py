@@ -31,7 +31,7 @@ ROBOSUITE = "robosuite==1.5.2"
 INSTALL_ROBOSUITE = f"pip install 'asm-gym[robosuite]' && pip install --no-deps {ROBOSUITE}"
 """Its declared mink==0.0.5 wants NumPy below 2; only the GR1 humanoid's inverse kinematics uses it."""
 
-TESTED = {"mujoco": SpecifierSet(">=3.4,<3.12"), "robosuite": Requirement(ROBOSUITE).specifier}
+TESTED = {"mujoco": SpecifierSet(">=3.4,<4.1"), "robosuite": Requirement(ROBOSUITE).specifier}
 """Versions with which the environments are tested."""
 
 

@@ -133,8 +133,11 @@ def pairs(wheel: Path) -> str:
     return "; ".join(wrong)
 
 
-MATRIX = ("3.11 numpy<2", "3.12 numpy<2", "3.11 numpy>=2", "3.12 numpy>=2", "3.13 numpy>=2")
-"""Pythons and NumPys; NumPy 1.26 has no build for Python 3.13."""
+MATRIX = (
+    *("3.11 numpy<2", "3.12 numpy<2", "3.11 numpy>=2", "3.12 numpy>=2", "3.13 numpy>=2"),
+    "3.13 mujoco>=4",
+)
+"""Pythons, and NumPys or the newest MuJoCo; NumPy 1.26 has no build for Python 3.13."""
 # variables that a fresh environment must not see
 OURS = (
     "PYTHONPATH",
@@ -148,20 +151,22 @@ def matrix(asked: str = "") -> int:
     """Run `make test` in fresh clones and environments, and return how many failed; ``asked`` picks some by name."""
     wrong = 0
     for name in (each for each in MATRIX if asked in each):
-        python, numpy = name.split()
-        # The tested versions; with NumPy 1 what still goes with it, but the same PyTorch.
-        keep, others = ("torch==", "'pyarrow<26'") if numpy == "numpy<2" else ("", "")
+        python, wanted = name.split()
+        # The tested versions but for the package that is asked for; with NumPy 1 what still goes with it, but the
+        # same PyTorch.
+        keep, others = ("torch==", "'pyarrow<26'") if wanted == "numpy<2" else ("", "")
+        package = re.split("[<>]", wanted)[0]
         with TemporaryDirectory(prefix="asm-gym-matrix-") as folder:
             pins = (
                 line
                 for line in (ROOT / "constraints.txt").read_text().splitlines(keepends=True)
-                if keep in line
+                if keep in line and not (package == "mujoco" and line.startswith("mujoco=="))
             )
             Path(folder, "pins.txt").write_text("".join(pins))
             steps = (
                 f"git clone -q --depth 1 file://{ROOT} tree",
                 f"uv venv -q --seed --python {python} tree/.venv",
-                f"uv pip install -q --python tree/.venv -c pins.txt -e 'tree[dev]' '{numpy}' {others}",
+                f"uv pip install -q --python tree/.venv -c pins.txt -e 'tree[dev]' '{wanted}' {others}",
                 f"uv pip install -q --python tree/.venv --no-deps {ROBOSUITE}",
                 "touch tree/.venv/.installed",
                 "make -C tree test",

@@ -78,7 +78,7 @@ def test_the_first_backend_that_draws_is_taken_and_looked_for_once(
 
 
 @pytest.mark.parametrize(
-    ("name", "version"), [("mujoco", "3.12.0"), ("mujoco", "3.3.7"), ("robosuite", "1.4.1")]
+    ("name", "version"), [("mujoco", "4.1.0"), ("mujoco", "3.3.7"), ("robosuite", "1.4.1")]
 )
 def test_a_version_out_of_range_is_needed_and_names_the_range(
     machine: Any, name: str, version: str
@@ -106,7 +106,7 @@ def test_an_old_gymnasium_is_named_with_what_replaces_it(machine: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "fits", "fails"), [("mujoco", "3.11.0", "3.12.0"), ("robosuite", "1.5.2", "1.5.1")]
+    ("name", "fits", "fails"), [("mujoco", "4.0.0", "4.1.0"), ("robosuite", "1.5.2", "1.5.1")]
 )
 def test_a_simulator_out_of_range_is_refused_before_it_is_imported(
     name: str, fits: str, fails: str, monkeypatch: pytest.MonkeyPatch

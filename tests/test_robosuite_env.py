@@ -11,6 +11,7 @@ import pytest
 
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import robots
+from asm_gym.envs.robosuite_backend import import_robosuite
 from asm_gym.policies import make_policy
 from asm_gym.spec import MOTOR
 from asm_gym.tasks import ROBOTS, TASKS
@@ -254,3 +255,31 @@ def test_every_robot_does_every_task(name, robot):
     assert not info["unstable"]
     assert env.unwrapped.simulation.compiled
     env.close()
+
+
+def test_overlapping_finger_links_touch_at_one_point_whatever_the_version_of_mujoco():
+    env = gym.make("asm_gym/Lift-v0", robot="IIWA")
+    env.reset(seed=0)
+    simulation = env.unwrapped.simulation
+    mesh = int(mujoco.mjtGeom.mjGEOM_MESH)
+    types = simulation.model.geom_type
+    touching = simulation.data.contact.geom
+    pairs = [tuple(geoms) for geoms in touching if (types[geoms] == mesh).all()]
+    env.close()
+    assert len(pairs) > 2
+    assert len(pairs) == len(set(pairs))
+
+
+def test_joints_of_every_type_have_their_addresses_under_every_version_of_mujoco():
+    import_robosuite()
+    from robosuite.utils.binding_utils import MjSim
+
+    kinds = ("free", "hinge", "ball", "slide")
+    bodies = "".join(
+        f'<body><joint name="{kind}" type="{kind}"/><geom size="0.1"/></body>' for kind in kinds
+    )
+    model = MjSim.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>").model
+    positions = [model.get_joint_qpos_addr(kind) for kind in kinds]
+    velocities = [model.get_joint_qvel_addr(kind) for kind in kinds]
+    assert positions == [(0, 7), 7, (8, 12), 12]
+    assert velocities == [(0, 6), 6, (7, 10), 10]

@@ -26,6 +26,10 @@ from asm_gym.validation import check_choice, check_number, check_text
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
 
+_POSITIONS = {int(mujoco.mjtJoint.mjJNT_FREE): 7, int(mujoco.mjtJoint.mjJNT_BALL): 4}
+_VELOCITIES = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}
+"""Numbers of a joint that has several, by its type."""
+
 # Tasks that choose one of several objects an episode: attributes with the objects and the choice.
 _CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("nuts", "nut_id")}
 
@@ -58,19 +62,47 @@ def _required() -> Any:
 
 
 def _fit_to_mujoco() -> None:
-    """Mend robosuite 1.5.2's mass matrix: MuJoCo 3.10 changed the arguments of ``mj_fullM``, 3.11 removed ``qM``."""
-    from robosuite.controllers.parts import controller
-    from robosuite.utils.binding_utils import MjData
+    """Adapt robosuite 1.5.2 to every MuJoCo from 3.4 to 4.0.
 
-    def whole_mass_matrix(model: mujoco.MjModel, whole: Floats, triangle: Floats) -> None:
-        rows = np.repeat(np.arange(model.nv), model.M_rownnz)
-        columns = model.M_colind
-        whole[:] = 0.0
-        whole[rows, columns] = triangle
-        whole[columns, rows] = triangle
+    - 3.10 changed the arguments of ``mj_fullM``, and 3.11 removed ``qM``.
+    - From 3.12 on an integer is not ``in`` a tuple of enum members: ``get_joint_qpos_addr`` and
+      ``get_joint_qvel_addr`` then fail in their assertion about the joint's type.
+
+    3.12 also moves contacts of overlapping meshes: see ``robots.iiwa.touch_at_one_point``.
+    """
+    from robosuite.controllers.parts import controller
+    from robosuite.utils.binding_utils import MjData, MjModel
 
     MjData.qM = property(lambda data: data._data.M)
-    controller.mujoco = SimpleNamespace(mj_fullM=whole_mass_matrix)
+    controller.mujoco = SimpleNamespace(mj_fullM=_whole_mass_matrix)
+    MjModel.get_joint_qpos_addr = _position_address
+    MjModel.get_joint_qvel_addr = _velocity_address
+
+
+def _whole_mass_matrix(model: mujoco.MjModel, whole: Floats, triangle: Floats) -> None:
+    rows = np.repeat(np.arange(model.nv), model.M_rownnz)
+    columns = model.M_colind
+    whole[:] = 0.0
+    whole[rows, columns] = triangle
+    whole[columns, rows] = triangle
+
+
+def _position_address(model: Any, name: str) -> Any:
+    joint = model.joint_name2id(name)
+    return _address(model.jnt_qposadr[joint], model.jnt_type[joint], _POSITIONS)
+
+
+def _velocity_address(model: Any, name: str) -> Any:
+    joint = model.joint_name2id(name)
+    return _address(model.jnt_dofadr[joint], model.jnt_type[joint], _VELOCITIES)
+
+
+def _address(first: Any, joint_type: Any, sizes: dict[int, int]) -> Any:
+    """Return where a joint's number lies, or first and end where it has several."""
+    size = sizes.get(int(joint_type), 1)
+    if size == 1:
+        return first
+    return first, first + size
 
 
 def _compile_less() -> None:
