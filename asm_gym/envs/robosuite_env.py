@@ -78,6 +78,9 @@ class RobosuiteEnv(SteppedEnv):
     - ``success``: whether the task is solved now; ``is_success``: whether it was in this episode, as
       Stable-Baselines3 reads it;
     - ``contact_force``: the largest net contact force on an arm within the step [N];
+    - ``contact_impulse``: that force beyond 40 N, summed over the physics substeps of the step [N s];
+    - ``joint_stops``, ``self_contacts``: joints at their stops at the end of the step, and contacts between parts of
+      robots, without those within a gripper;
     - ``unstable``: the simulation diverged: the episode is truncated, its last stream NaN, its last observation 0.
 
     Args:

@@ -11,9 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, bind, must_compile
-from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import FREE_FORCE, ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
-from asm_gym.envs.arms import bodies, controller_of, describe, describe_inputs, is_compilable
+from asm_gym.envs.arms import (
+    PHYSICS_FREQ,
+    bodies,
+    controller_of,
+    describe,
+    describe_inputs,
+    is_compilable,
+)
 from asm_gym.envs.controller_inputs import Gripper
 from asm_gym.envs.controllers import HELD
 from asm_gym.envs.mujoco_views import (
@@ -30,6 +37,7 @@ from asm_gym.envs.mujoco_views import (
 )
 from asm_gym.envs.nominal_dynamics import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
+from asm_gym.envs.wear import WearSensor
 from asm_gym.spec import Channel
 
 
@@ -63,6 +71,7 @@ class Simulation:
             speed_limits=self.speed_limits,
         )
         self.proprioception = Proprioception(self.parts, self.views, self.data)
+        self.wear = WearSensor(self.parts, self.model, self.data)
         self.contact_force = 0.0
         """The largest net contact force on an arm within the control step [N]. In the sum over its bodies a grasp's own
         squeeze cancels; loads that a fault applies are left out."""
@@ -75,6 +84,7 @@ class Simulation:
         self._substeps_done = 0  # of the control step
         self._row_start = 0  # substep of the control step at which the row begins
         self._force_of_earlier_rows = 0.0  # the largest in this control step [N]
+        self._impulse_of_earlier_rows = 0.0  # in this control step [N s]
         self._pressed = False  # a contact limit was passed in the control step before
         self._has_new_command = False  # that the controllers have not taken up
         self._samples[:] = 0.0
@@ -138,6 +148,7 @@ class Simulation:
         self._substeps_done = 0
         self._row_start = 0
         self._force_of_earlier_rows = 0.0
+        self._impulse_of_earlier_rows = 0.0
         self._pressed = self.load > 1.0
         self._limits.load_share[0] = 0.0
         self._limits.status[:] = 0
@@ -228,6 +239,7 @@ class Simulation:
     def begin_row(self) -> None:
         """Begin another row of the stream; the contact force goes on to be that of the whole control step."""
         self._force_of_earlier_rows = self.contact_force
+        self._impulse_of_earlier_rows = self.contact_impulse
         self._row_start = self._substeps_done
 
     @property
@@ -266,6 +278,12 @@ class Simulation:
         """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
         forces = self._samples[:, : self._substeps_done - self._row_start, kernels.CONTACT]
         return np.linalg.norm(forces, axis=2).max(axis=0)
+
+    @property
+    def contact_impulse(self) -> float:
+        """Contact force beyond ``FREE_FORCE``, summed over the substeps of the control step so far [N s]."""
+        excess = np.maximum(self.contact_forces - FREE_FORCE, 0.0)
+        return self._impulse_of_earlier_rows + float(excess.sum()) / PHYSICS_FREQ
 
     def sense(self, other_values: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
         """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began.

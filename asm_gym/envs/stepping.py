@@ -162,11 +162,18 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         )
 
     def _forces(self, unstable: bool) -> dict[str, Any]:
-        """Return what ``info`` says of contact: NaN without limits; NaN or infinite where the simulation diverged."""
+        """Return what ``info`` says of contact and wear.
+
+        It is NaN without limits; NaN or infinite where the simulation diverged.
+        """
         simulation = self.simulation
         felt = simulation.felt_mean
+        wear = simulation.wear.read()
         forces: dict[str, Any] = {
             "contact_force": simulation.contact_force,
+            "contact_impulse": simulation.contact_impulse,
+            "joint_stops": wear.joint_stops,
+            "self_contacts": wear.self_contacts,
             "braked": 0.0,
             "contact_load": np.nan,
             "contact_left_s": np.nan,
@@ -181,6 +188,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             forces["contact_felt"] = felt
         if unstable:
             forces["contact_force"] = np.nan
+            forces["contact_impulse"] = np.nan
             if self.contact_limits is not None:
                 forces["contact_load"] = np.inf
         return forces

@@ -78,11 +78,28 @@ class Rate(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A number and its 95 % bootstrap interval."""
+    """A number and its 95 % interval, of a bootstrap or of Student's t."""
 
     value: float
     low: float
     high: float
+
+    @classmethod
+    def of_mean(cls, values: Sequence[float]) -> Estimate:
+        """Return the mean of one value a seed, with the interval of Student's t; NaN for that of a single one."""
+        mean = float(np.mean(values))
+        if len(values) < 2:
+            return cls(mean, math.nan, math.nan)
+        error = float(np.std(values, ddof=1)) / math.sqrt(len(values))
+        half = float(stats.t.ppf(0.975, len(values) - 1)) * error
+        return cls(mean, mean - half, mean + half)
+
+    def text(self, digits: int = 1) -> str:
+        """``value (low to high)``; the value alone without an interval."""
+        value = f"{self.value:,.{digits}f}"
+        if math.isnan(self.low):
+            return value
+        return f"{value} ({self.low:,.{digits}f} to {self.high:,.{digits}f})"
 
 
 class Spread(NamedTuple):

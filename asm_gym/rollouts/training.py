@@ -27,6 +27,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from asm_gym.data.episode import Episode
 from asm_gym.policies.network import NetworkPolicy, describe
+from asm_gym.rollouts.executed_sac import ExecutedSAC
 from asm_gym.rollouts.parallel import Progress
 
 ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
@@ -88,29 +89,13 @@ class NormalisedCritic(SACPolicy):
         return critic
 
 
-class GuardedSAC(SAC):
+class GuardedSAC(ExecutedSAC):
     """SAC with a slow actor, whose replay buffer holds the actions that a safety wrapper executed."""
 
     def _update_learning_rate(self, optimizers: Any) -> None:
         super()._update_learning_rate(optimizers)
         for group in self.actor.optimizer.param_groups:
             group["lr"] *= ACTOR_SHARE
-
-    def _store_transition(
-        self,
-        buffer: Any,
-        action: Any,
-        next_observation: Any,
-        reward: Any,
-        dones: Any,
-        infos: Any,
-    ) -> None:
-        executed = np.array(action)
-        for n, info in enumerate(infos):
-            override = info.get("asm", {}).get("executed_action")
-            if override is not None:
-                executed[n] = self.policy.scale_action(override)
-        super()._store_transition(buffer, executed, next_observation, reward, dones, infos)
 
 
 def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:

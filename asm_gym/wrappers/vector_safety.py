@@ -234,6 +234,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         return observations, rewards, *ends, infos
 
     def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
+        # Learners read the executed action in every step: it is there without the rest.
+        asm["executed_action"] = self._executed.reshape(self.env.action_space.shape or ()).copy()
         for name, values in {"asm": asm, **numbers}.items():
             target[name] = values
             target[f"_{name}"] = self._present  # Gymnasium's mask of the members that it tells of
@@ -297,10 +299,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         spec = self.monitor.spec
         commanded = self._commanded.copy()
         executed = self._executed.copy()
-        step: dict[str, Any] = {
-            "alarms": self._alarms.copy(),
-            "executed_action": executed.reshape(self.env.action_space.shape or ()),
-        }
+        step: dict[str, Any] = {"alarms": self._alarms.copy()}
         for name, value in self._running_threshold().items():
             step[name] = np.full(self.num_envs, value)
 

@@ -15,13 +15,14 @@ STUDIES = {
     "repertoire": "capacity, forgetting and labels on letters, beside movement primitives",
     "panda": "one network learns six skills of the Panda without labels",
     "harm": "harm that the guard avoids, and success that it keeps",
+    "learning": "agents that learn from scratch: harm and reward, alone and under guards",
     "chunks": "impacts predicted from chunks of actions, and false predictions",
     "day": "a simulated day of an arm: incidents against ten events",
     "hours": "false alarms an hour of a shipped memory; needs a corpus",
     "real_arms": "faults added to recordings of real arms (to download)",
 }
 
-MODULES = {"panda": "six_skills"}
+MODULES = {"panda": "six_skills", "learning": "learning_safely"}
 """Modules of studies that are not named after them."""
 
 

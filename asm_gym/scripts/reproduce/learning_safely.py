@@ -1,0 +1,407 @@
+"""Learning from scratch: what a guard does for an agent that explores, and what it costs the agent.
+
+PPO and SAC of stable-baselines3 learn four motions alone, under guards, and with the cost of alarms in the reward.
+Harm is the contact force on the arm beyond 40 N, summed over all physics substeps of learning [N s], from the
+simulator. Every run has a file of its own: the same command continues after a kill. A run of 40,960 steps takes about
+two minutes of one core, the whole study about eight hours of two.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.envs.vector import ThreadedVectorEnv, cores
+from asm_gym.files import write_text
+from asm_gym.guard.responses import CAUSES, PRESSING
+from asm_gym.rollouts.executed_sac import ExecutedSAC
+from asm_gym.rollouts.learner_vector import LearnerVector
+from asm_gym.rollouts.learning_record import LearningRecord
+from asm_gym.rollouts.priced_cost import Lagrangian, PricedCost
+from asm_gym.rollouts.run_folder import claimed, make_missing
+from asm_gym.scripts.command import option
+from asm_gym.scripts.reproduce import kit, learning_tables
+from asm_gym.tasks import ROBOTS, env_id
+from asm_gym.wrappers import VectorNeuralASMSafety
+from asm_gym.wrappers.env_attributes import askable
+
+ALONE = "alone"
+DEFAULT = "default"
+REACH = "Reach"
+TASKS = ("Lift", "Door", "Stack", REACH)
+REACHED = 0.03  # a hand so near to the cube has reached it [m]
+SLOW = 0.15  # of the fixed speed limit [m/s]
+GOING_ON = {cause: "go on" for cause in CAUSES if not cause.endswith(PRESSING)}
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to learn."""
+
+    guard: dict[str, Any] | None = None
+    """Settings of the wrapper; None for no guard."""
+    hand_speed: float = math.inf
+    """A fixed limit of the hand's speed, without a guard [m/s]."""
+    price: float = 0.0
+    """What a step in alarm costs, in reward."""
+    cost_limit: float | None = None
+    """The mean cost of a step that the price is to lead to; None for a fixed price."""
+
+
+WAYS = {
+    ALONE: Way(),
+    DEFAULT: Way(guard={}),
+    "contact limits": Way(guard={"responses": GOING_ON}),
+    "speed limit": Way(hand_speed=SLOW),
+    "cost in reward": Way(guard={"on_alarm": "monitor"}, price=0.1),
+    "Lagrangian": Way(guard={"on_alarm": "monitor"}, cost_limit=0.05),
+    "truncated": Way(guard={"truncate": True}),
+}
+"""Ways by name. *contact limits* goes on at every alarm that is no pressing; *truncated* is the default that truncates
+episodes where the default terminates them."""
+PRICED = ("cost in reward", "Lagrangian")  # ways of PPO alone
+PRICE_RATE = 0.2  # of the price that follows a limit, for each rollout
+
+
+class PPOSettings(NamedTuple):
+    """Settings of PPO beside stable-baselines3's own."""
+
+    n_steps: int = 256
+    batch_size: int = 256
+    gamma: float = 0.98
+
+
+ALGORITHMS = ("PPO", "SAC", "SAC, chosen action")
+
+
+@dataclass(frozen=True)
+class Config(kit.Config):
+    """Agents that learn from scratch, alone and under guards."""
+
+    seeds: int = option(5, quick=2, least=1)
+    """Number of repetitions; they take the seeds that follow."""
+    tasks: tuple[str, ...] = option(TASKS, quick=(REACH,), known=TASKS, metavar="TASK")
+    """What is learned. Reach is Lift's scene with the reward of its first part: the hand moves to the cube."""
+    algorithms: tuple[str, ...] = option(
+        ("PPO", "SAC"), quick=("PPO",), known=ALGORITHMS, metavar="NAME"
+    )
+    """How it is learned. SAC stores the executed action; *SAC, chosen action* that of the policy."""
+    ways: tuple[str, ...] = option(
+        (ALONE, DEFAULT, "contact limits", "speed limit", *PRICED),
+        quick=(ALONE, DEFAULT),
+        known=WAYS,
+        metavar="NAME",
+    )
+    """Under which guard, or at which price of alarms."""
+    robot: str = option("Panda", known=ROBOTS)
+    """The arm."""
+    steps: int = option(40_960, quick=1_024, least=1)
+    """Control steps of each run."""
+    envs: int = option(8, quick=2, least=1)
+    """Environments side by side."""
+    evaluation_episodes: int = option(24, quick=2, least=1)
+    """Episodes of the trained policy, alone and under the default guard."""
+    pace_envs: tuple[int, ...] = option((8, 16), quick=(2,))
+    """Sizes of vectors in which steps a second are compared, with a guard and without."""
+    pace_blocks: int = option(6, quick=2, least=0)
+    """How often they are compared; 0 for not at all."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One agent that learns."""
+
+    task: str
+    algorithm: str
+    way: str
+    seed: int
+    robot: str
+    steps: int
+    envs: int
+    evaluation_episodes: int
+    threads: int = field(default=1)
+
+    @property
+    def key(self) -> kit.Record:
+        """What distinguishes it from other runs of a study."""
+        names = ("robot", "task", "algorithm", "way", "seed")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def file_name(self) -> str:
+        """Name of its file."""
+        parts = [str(value).replace(",", "").replace(" ", "_") for value in self.key.values()]
+        return "-".join(parts) + ".json"
+
+
+def runs(config: Config) -> list[Run]:
+    """Return the runs of a study, seed by seed."""
+    found = []
+    threads = max(1, cores() // config.workers)
+    conditions = product(config.repetitions, config.tasks, config.algorithms, config.ways)
+    for seed, task, algorithm, way in conditions:
+        if way in PRICED and algorithm != "PPO":
+            continue
+        run = Run(
+            task=task,
+            algorithm=algorithm,
+            way=way,
+            seed=seed,
+            robot=config.robot,
+            steps=config.steps,
+            envs=config.envs,
+            evaluation_episodes=config.evaluation_episodes,
+            threads=threads,
+        )
+        found.append(run)
+    return found
+
+
+# ------------------------------------------------------------------ environments
+
+
+class Reach(gym.Wrapper[Any, Any, Any, Any]):
+    """Lift's scene, in which the hand is to move to the cube and needs to lift nothing."""
+
+    def step(self, action: Any) -> Any:
+        observation, _, terminated, truncated, info = self.env.step(action)
+        arm: Any = self.unwrapped
+        scene = arm.robosuite_env
+        distance = scene._gripper_to_target(
+            gripper=scene.robots[0].gripper,
+            target=scene.cube.root_body,
+            target_type="body",
+            return_distance=True,
+        )
+        info["success"] = bool(distance < REACHED)
+        reward = 1.0 - np.tanh(10.0 * distance)
+        return observation, float(reward), terminated, truncated, info
+
+
+class SpeedLimited(VectorWrapper):
+    """A fixed limit of the hands' speed, which neither a memory nor a force lowers.
+
+    Args:
+        env: a vector of this package's environments.
+        hand_speed: the limit [m/s].
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], hand_speed: float) -> None:
+        super().__init__(env)
+        self._limits = ContactLimits(
+            wrist_force=math.inf,
+            external_torque=math.inf,
+            hand_speed=hand_speed,
+            stays=False,
+        )
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        result = self.env.reset(seed=seed, options=options)
+        named_limits = [("speed limit", self._limits)] * self.num_envs
+        askable(self.env).set_attr("limits_of_guard", named_limits)
+        return result
+
+
+def member(task: str, robot: str) -> gym.Env[Any, Any]:
+    """Return one environment of a task of this study."""
+    if task == REACH:
+        return Reach(gym.make(env_id("Lift"), robot=robot))
+    return gym.make(env_id(task), robot=robot)
+
+
+@contextmanager
+def vector(task: str, robot: str, count: int, threads: int) -> Iterator[ThreadedVectorEnv]:
+    """Make a vector of a task, and close it when the block ends."""
+    make = partial(member, task, robot)
+    envs = ThreadedVectorEnv([make] * count, threads, AutoresetMode.DISABLED)
+    try:
+        yield envs
+    finally:
+        envs.close()
+
+
+def recorded(envs: VectorEnv[Any, Any, Any], way: Way) -> LearningRecord:
+    """Return a vector under the guard of a way, with a record of its episodes."""
+    if math.isfinite(way.hand_speed):
+        envs = SpeedLimited(envs, way.hand_speed)
+    if way.guard is not None:
+        envs = VectorNeuralASMSafety(envs, **way.guard)
+    return LearningRecord(envs)
+
+
+# ------------------------------------------------------------------ one run
+
+
+class Learner(NamedTuple):
+    """An agent, and what it learns from."""
+
+    agent: BaseAlgorithm
+    scaled: VecNormalize
+    callbacks: list[BaseCallback]
+
+
+def make_learner(algorithm: str, envs: LearningRecord, way: Way, seed: int) -> Learner:
+    """Return an untrained agent in a recorded vector."""
+    learned_from: Any = LearnerVector(envs)
+    callbacks: list[BaseCallback] = []
+    if way.price > 0 or way.cost_limit is not None:
+        learned_from = PricedCost(learned_from, way.price)
+        if way.cost_limit is not None:
+            callbacks.append(Lagrangian(learned_from, way.cost_limit, PRICE_RATE))
+    scaled = VecNormalize(learned_from, norm_reward=False)
+    agent: BaseAlgorithm
+    if algorithm == "PPO":
+        settings = PPOSettings()._asdict()
+        agent = PPO("MlpPolicy", scaled, seed=seed, device="cpu", **settings)
+    else:
+        kind = ExecutedSAC if algorithm == "SAC" else SAC
+        agent = kind(
+            "MlpPolicy",
+            scaled,
+            learning_starts=1_000,
+            gamma=0.98,
+            gradient_steps=-1,  # one for each step of a member
+            seed=seed,
+            device="cpu",
+        )
+    return Learner(agent, scaled, callbacks)
+
+
+def learn(run: Run, folder: Path) -> Path:
+    """Train the agent of a run, judge it, and write what came of it; return the file."""
+    torch.set_num_threads(1)  # more of them slow networks this small down
+    way = WAYS[run.way]
+    with vector(run.task, run.robot, run.envs, run.threads) as envs:
+        record = recorded(envs, way)
+        learner = make_learner(run.algorithm, record, way, run.seed)
+        wall = time.perf_counter()
+        processor = time.process_time()
+        learner.agent.learn(run.steps, learner.callbacks)
+        seconds = time.perf_counter() - wall
+        processor_seconds = time.process_time() - processor
+        period = float(envs.get_attr("dt")[0])
+        rounds = math.ceil(run.evaluation_episodes / run.envs)
+        trained = {
+            name: play(learner, recorded(envs, WAYS[name]), rounds, run.seed)
+            for name in (ALONE, DEFAULT)
+        }
+    result = {
+        **run.key,
+        "period": period,
+        "seconds": seconds,
+        "processor_seconds": processor_seconds,
+        "steps": record.steps,
+        "learning": columns(record.episodes),
+        "trained": trained,
+    }
+    path = folder / run.file_name
+    write_text(path, json.dumps(result) + "\n")
+    return path
+
+
+def play(learner: Learner, envs: LearningRecord, rounds: int, seed: int) -> kit.Record:
+    """Return the columns of ``rounds`` episodes of each member under a trained policy, without exploration."""
+    vector = LearnerVector(envs)
+    vector.seed(10_000 + 100 * seed)  # scenes that learning has not begun with
+    observations = vector.reset()
+    while True:
+        scaled = learner.scaled.normalize_obs(observations)
+        actions, _ = learner.agent.predict(scaled, deterministic=True)
+        observations, *_ = vector.step(actions)
+        first: list[kit.Record] = []  # episodes of each member: a member of short ones ends more
+        for number in range(envs.num_envs):
+            own = [each for each in envs.episodes if each["member"] == number]
+            first += own[:rounds]
+        if len(first) == rounds * envs.num_envs:
+            return columns(first)
+
+
+def columns(episodes: Sequence[kit.Record]) -> kit.Record:
+    """Return the episodes as lists by name."""
+    return pd.DataFrame(list(episodes)).to_dict(orient="list")
+
+
+# ------------------------------------------------------------------ pace
+
+
+def measure_pace(task: str, robot: str, count: int, blocks: int, threads: int) -> list[kit.Record]:
+    """Return how many steps a second PPO makes in a vector, alone and under the default guard in turn.
+
+    Both learn in the same environments, block after block, so that a busy machine slows both down.
+    """
+    found = []
+    with vector(task, robot, count, threads) as envs:
+        learners = {}
+        for name in (ALONE, DEFAULT):
+            way = WAYS[name]
+            learners[name] = make_learner("PPO", recorded(envs, way), way, seed=0)
+        block_steps = PPOSettings().n_steps * count
+        for block in range(blocks + 1):
+            for name, learner in learners.items():
+                wall = time.perf_counter()
+                processor = time.process_time()
+                learner.agent.learn(block_steps)
+                pace: kit.Record = {
+                    "task": task,
+                    "robot": robot,
+                    "envs": count,
+                    "way": name,
+                    "seed": block,
+                    "steps_s": block_steps / (time.perf_counter() - wall),
+                    "processor_steps_s": block_steps / (time.process_time() - processor),
+                }
+                if block > 0:  # in the first some code is still compiled
+                    found.append(pace)
+    return found
+
+
+# ------------------------------------------------------------------ the study
+
+
+def run(config: Config) -> kit.Findings:
+    """Run what is missing, and sum it up."""
+    folder = config.out / "learning"
+    settings = {
+        "steps": config.steps,
+        "envs": config.envs,
+        "evaluation_episodes": config.evaluation_episodes,
+    }
+    wanted = runs(config)
+    with claimed(folder, "settings.json", settings), kit.stage("learning") as report:
+        files = make_missing(
+            partial(learn, folder=folder),
+            wanted,
+            lambda run: folder / run.file_name,
+            config.workers,
+            report,
+        )
+    results = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+
+    paces: list[kit.Record] = []
+    if config.pace_blocks:
+        with kit.stage("pace") as report:
+            for n, count in enumerate(config.pace_envs):
+                report(n, len(config.pace_envs))
+                paces += measure_pace(
+                    config.tasks[0], config.robot, count, config.pace_blocks, cores()
+                )
+    return learning_tables.findings(results, paces)

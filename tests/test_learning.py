@@ -1,0 +1,265 @@
+"""Learning under a guard: vectors for learners, what is recorded, what is refused, and the study."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
+from gymnasium.wrappers import RescaleAction
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from asm_gym.envs.wear import GRIPPER, LINK, self_contacts
+from asm_gym.evaluation.statistics import Estimate
+from asm_gym.exceptions import UnsupportedEnvironment
+from asm_gym.rollouts.executed_sac import ExecutedSAC
+from asm_gym.rollouts.learner_vector import LearnerVector
+from asm_gym.rollouts.learning_record import LearningRecord
+from asm_gym.rollouts.priced_cost import Lagrangian, PricedCost
+from asm_gym.rollouts.safety_callback import FIRST_STEPS, SafetyCallback
+from asm_gym.scripts.reproduce import learning_safely, learning_tables
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from tests.fakes import CueMonitor, FakeEnv
+
+
+def vector(*lengths):
+    makes = [lambda length=length: FakeEnv(length=length) for length in lengths]
+    return SyncVectorEnv(makes, autoreset_mode=AutoresetMode.DISABLED)
+
+
+# ------------------------------------------------------------------ the learner's vector
+
+
+def test_a_member_that_ended_begins_again_while_the_others_go_on():
+    envs = LearnerVector(vector(2, 3))
+    first = envs.reset()
+    actions = np.zeros((2, 3), np.float32)
+    ends = []
+    for _ in range(6):
+        observations, _, dones, infos = envs.step(actions)
+        ends.append(dones.tolist())
+        for n in np.flatnonzero(dones):
+            assert infos[n]["TimeLimit.truncated"]
+            np.testing.assert_array_equal(observations[n], first[n])
+            assert (infos[n]["terminal_observation"] != observations[n]).any()
+    assert [list(column) for column in zip(*ends, strict=True)] == [
+        [False, True] * 3,
+        [False, False, True] * 2,
+    ]
+
+
+def test_the_learner_meets_the_same_alarms_in_a_vector_as_in_single_environments():
+    def single():
+        return NeuralASMSafety(FakeEnv(length=8), CueMonitor((2, 3)), on_alarm="monitor")
+
+    together = VectorNeuralASMSafety(vector(8, 8), CueMonitor((2, 3)), on_alarm="monitor")
+    costs = []
+    for envs in (DummyVecEnv([single, single]), LearnerVector(together)):
+        callback = SafetyCallback()
+        PPO("MlpPolicy", envs, n_steps=16, batch_size=16, seed=0).learn(32, callback)
+        costs.append([episode["cost"] for episode in callback.ended])
+    assert costs[0] == costs[1] == [2.0] * 4
+
+
+def test_another_autoreset_mode_is_refused():
+    with pytest.raises(UnsupportedEnvironment, match="NEXT_STEP"):
+        LearnerVector(SyncVectorEnv([FakeEnv]))
+
+
+# ------------------------------------------------------------------ what is stored and refused
+
+
+def test_sac_stores_what_the_guard_executed():
+    guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="hold")
+    agent = ExecutedSAC("MlpPolicy", guarded, learning_starts=100, seed=0, buffer_size=64)
+    agent.learn(8)
+    held = (agent.replay_buffer.actions[:8, 0] == 0).all(axis=1)
+    assert held.any()
+    assert not held.all()
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_actions_changed_outside_the_guard_are_refused(many):
+    if many:
+        rescaled = gym.wrappers.vector.RescaleAction(
+            VectorNeuralASMSafety(vector(8, 8), CueMonitor((2,)), on_alarm="monitor"), -2.0, 2.0
+        )
+        envs = LearnerVector(rescaled)
+    else:
+        guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="hold")
+        envs = RescaleAction(guarded, -2.0, 2.0)
+    with pytest.raises(UnsupportedEnvironment, match="RescaleAction outside the guard"):
+        ExecutedSAC("MlpPolicy", envs)
+
+
+class HidesEnds(gym.Wrapper):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            observation, _ = self.env.reset()
+        return observation, reward, False, False, info
+
+
+def test_a_wrapper_that_hides_ends_is_named():
+    hidden = HidesEnds(NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="monitor"))
+    agent = PPO("MlpPolicy", hidden, n_steps=32, batch_size=32)
+    with pytest.raises(ValueError, match="hides that the episode ended"):
+        agent.learn(32, SafetyCallback())
+
+
+@pytest.mark.parametrize(("cue", "warns"), [(range(8), True), ((2,), False)])
+def test_a_memory_that_alarms_in_most_first_steps_is_named(cue, warns, recwarn):
+    guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor(tuple(cue)), on_alarm="monitor")
+    agent = PPO("MlpPolicy", guarded, n_steps=FIRST_STEPS, batch_size=250, n_epochs=1)
+    agent.learn(FIRST_STEPS, SafetyCallback())
+    assert warns == any("first 1000 steps" in str(each.message) for each in recwarn)
+
+
+# ------------------------------------------------------------------ records
+
+
+class Scripted(VectorWrapper):
+    """Reports contact as it is told."""
+
+    def __init__(self, env, forces):
+        super().__init__(env)
+        self.forces = iter(forces)
+
+    def step(self, actions):
+        observations, _, terminated, truncated, infos = self.env.step(actions)
+        force = np.array(next(self.forces), float)
+        infos["contact_force"] = force
+        infos["contact_impulse"] = np.maximum(force - 40.0, 0.0) / 500
+        infos["success"] = force > 500
+        infos["joint_stops"] = np.array([1, 0])
+        infos["self_contacts"] = np.array([0, 2])
+        return observations, np.ones(2), terminated, truncated, infos
+
+
+def test_a_record_adds_up_each_episode():
+    forces = [(30, 300), (290, 300), (281, 0), (0, 600)]
+    record = LearningRecord(Scripted(vector(4, 2), forces))
+    record.reset(seed=0)
+    for n in range(4):
+        *_, terminated, truncated, _ = record.step(np.zeros((2, 3), np.float32))
+        ended = terminated | truncated
+        if ended.any() and n < 3:
+            record.reset(options={"reset_mask": ended})
+    frame = pd.DataFrame(record.episodes)
+    assert frame.member.tolist() == [1, 0, 1]
+    assert frame.step.tolist() == [4, 8, 8]
+    assert frame.length.tolist() == [2, 4, 2]
+    assert frame.blows.tolist() == [1, 1, 1]  # steps that follow each other are one contact
+    assert frame.peak.tolist() == [300, 290, 600]
+    assert frame.success.tolist() == [0, 0, 1]
+    assert frame.joint_stops.tolist() == [0, 4, 0]
+    assert frame.self_contacts.tolist() == [4, 0, 4]
+    harm = [2 * 260, 250 + 241, 560]
+    np.testing.assert_allclose(frame.harm, np.array(harm) / 500)
+
+
+def test_only_what_is_of_the_arm_and_no_gripper_counts_as_self_contact():
+    kinds = np.array([0, GRIPPER, GRIPPER, LINK, LINK])
+    pairs = np.array([(0, 3), (1, 2), (1, 3), (3, 4), (0, 1)], np.int32)
+    assert self_contacts(pairs, kinds) == 2
+
+
+class CostlyVector(DummyVecEnv):
+    def step_wait(self):
+        observations, rewards, dones, infos = super().step_wait()
+        for info in infos:
+            info["cost"] = 1.0
+        return observations, rewards, dones, infos
+
+
+def test_a_price_follows_its_limit_and_lowers_the_reward():
+    plain = CostlyVector([lambda: FakeEnv(length=4)])
+    plain.reset()
+    reward = plain.step(np.zeros((1, 3), np.float32))[1]
+    priced = PricedCost(CostlyVector([lambda: FakeEnv(length=4)]), price=0.5)
+    priced.reset()
+    np.testing.assert_allclose(priced.step(np.zeros((1, 3), np.float32))[1], reward - 0.5)
+
+    priced.price = 0.0
+    priced.costs.clear()
+    agent = PPO("MlpPolicy", priced, n_steps=8, batch_size=8)
+    agent.learn(24, Lagrangian(priced, limit=0.25, rate=0.1))
+    assert priced.price == pytest.approx(3 * 0.1 * 0.75)
+
+
+# ------------------------------------------------------------------ the study
+
+
+def result(way, seed, harm, rewards, task="Reach"):
+    count = len(rewards)
+    episodes = {
+        "step": [100 * (n + 1) for n in range(count)],
+        "member": [0] * count,
+        "length": [100] * count,
+        "reward": rewards,
+        "success": [0.0] * (count - 1) + [1.0],
+        "harm": [harm / count] * count,
+        "peak": [300.0] * count,
+        "blows": [1] * count,
+        "overridden": [10] * count,
+        "slowed": [50] * count,
+        "cost": [5] * count,
+        "joint_stops": [0] * count,
+        "self_contacts": [1] * count,
+    }
+    return {
+        "robot": "Panda",
+        "task": task,
+        "algorithm": "PPO",
+        "way": way,
+        "seed": seed,
+        "period": 0.05,
+        "seconds": 10.0,
+        "processor_seconds": 20.0,
+        "steps": 100 * count,
+        "learning": episodes,
+        "trained": {"alone": episodes, "default": episodes},
+    }
+
+
+def test_harm_is_compared_with_that_of_the_same_seed():
+    results = [
+        result("alone", 0, 100.0, [1.0] * 10),
+        result("alone", 1, 300.0, [1.0] * 10),
+        result("default", 0, 1.0, [1.0] * 10),
+        result("default", 1, 9.0, [1.0] * 10),
+    ]
+    found = learning_tables.findings(results, [])
+    rows = [dict(zip(found.tables[0].headings, row, strict=True)) for row in found.tables[0].rows]
+    default = next(row for row in rows if row["way"] == "default")
+    shares = Estimate.of_mean([1.0, 3.0])
+    assert default["of that alone [%]"] == shares.text(2)
+    assert default["overridden [%]"].startswith("10.0")
+    # 10 episodes of 100 steps of 0.05 s
+    assert found.records[2]["harm_hour"] == pytest.approx(1.0 / (50 / 3600))
+    assert found.figure is not None
+
+
+def test_a_reward_counts_as_reached_in_the_mean_of_many_episodes():
+    rewards = [0.0] * 20 + [10.0] * 20
+    episodes = pd.DataFrame(result("alone", 0, 0.0, rewards)["learning"])
+    # 5 in the mean after 10 of the second kind
+    assert learning_tables.steps_to_target(episodes, 5.0) == 3000
+    assert math.isnan(learning_tables.steps_to_target(episodes, 11.0))
+
+
+def test_an_interval_of_a_mean_is_students():
+    estimate = Estimate.of_mean([1.0, 2.0, 6.0])
+    half = 4.302652729911275 * math.sqrt(7.0) / math.sqrt(3.0)
+    np.testing.assert_allclose(estimate, (3.0, 3.0 - half, 3.0 + half))
+    assert Estimate.of_mean([2.0]).text() == "2.0"
+
+
+def test_every_run_of_the_study_has_a_file_of_its_own():
+    config = learning_safely.Config(algorithms=learning_safely.ALGORITHMS)
+    wanted = learning_safely.runs(config)
+    names = {run.file_name for run in wanted}
+    assert len(names) == len(wanted) == 5 * 4 * (6 + 4 + 4)
+    assert [run.seed for run in wanted] == sorted(run.seed for run in wanted)
