@@ -21,7 +21,7 @@ from asm_gym.rollouts.priced_cost import Lagrangian, PricedCost
 from asm_gym.rollouts.safety_callback import FIRST_STEPS, SafetyCallback
 from asm_gym.scripts.reproduce import learning_safely, learning_tables
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from tests.fakes import CueMonitor, FakeEnv
+from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 
 
 def vector(*lengths):
@@ -52,15 +52,17 @@ def test_a_member_that_ended_begins_again_while_the_others_go_on():
 
 def test_the_learner_meets_the_same_alarms_in_a_vector_as_in_single_environments():
     def single():
-        return NeuralASMSafety(FakeEnv(length=8), CueMonitor((2, 3)), on_alarm="monitor")
+        return NeuralASMSafety(FakeEnv(length=8), FadingMonitor((2, 6)), on_alarm="monitor")
 
-    together = VectorNeuralASMSafety(vector(8, 8), CueMonitor((2, 3)), on_alarm="monitor")
+    together = VectorNeuralASMSafety(vector(8, 8), FadingMonitor((2, 6)), on_alarm="monitor")
     costs = []
     for envs in (DummyVecEnv([single, single]), LearnerVector(together)):
         callback = SafetyCallback()
         PPO("MlpPolicy", envs, n_steps=16, batch_size=16, seed=0).learn(32, callback)
         costs.append([episode["cost"] for episode in callback.ended])
-    assert costs[0] == costs[1] == [2.0] * 4
+    assert costs[0] == costs[1]
+    assert len(costs[0]) == 4
+    assert min(costs[0]) > 0
 
 
 def test_another_autoreset_mode_is_refused():
@@ -75,7 +77,7 @@ def test_sac_stores_what_the_guard_executed():
     guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="hold")
     agent = ExecutedSAC("MlpPolicy", guarded, learning_starts=100, seed=0, buffer_size=64)
     agent.learn(8)
-    held = (agent.replay_buffer.actions[:8, 0] == 0).all(axis=1)
+    held = (agent.replay_buffer.actions[:8, 0, :2] == 0).all(axis=1)  # the third is the grip
     assert held.any()
     assert not held.all()
 
@@ -84,7 +86,7 @@ def test_sac_stores_what_the_guard_executed():
 def test_actions_changed_outside_the_guard_are_refused(many):
     if many:
         rescaled = gym.wrappers.vector.RescaleAction(
-            VectorNeuralASMSafety(vector(8, 8), CueMonitor((2,)), on_alarm="monitor"), -2.0, 2.0
+            VectorNeuralASMSafety(vector(8, 8), FadingMonitor((2,)), on_alarm="monitor"), -2.0, 2.0
         )
         envs = LearnerVector(rescaled)
     else:

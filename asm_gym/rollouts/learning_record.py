@@ -88,12 +88,9 @@ class LearningRecord(VectorWrapper):
         """Keep the episode of a member, which has ended."""
         sums = dict(zip(SUMS, self._sums[member].tolist(), strict=True))
         peaks = dict(zip(PEAKS, self._peaks[member].tolist(), strict=True))
-        self.episodes.append(
-            {
-                "step": self.steps,
-                "member": member,
-                "length": int(self._lengths[member]),
-                **sums,
-                **peaks,
-            }
-        )
+        episode = {
+            "step": self.steps,
+            "member": member,
+            "length": int(self._lengths[member]),
+        }
+        self.episodes.append(episode | sums | peaks)
