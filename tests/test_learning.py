@@ -11,7 +11,6 @@ from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from asm_gym.envs.wear import GRIPPER, LINK, self_contacts
 from asm_gym.evaluation.statistics import Estimate
 from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.rollouts.executed_sac import ExecutedSAC
@@ -160,12 +159,6 @@ def test_a_record_adds_up_each_episode():
     assert frame.self_contacts.tolist() == [4, 0, 4]
     harm = [2 * 260, 250 + 241, 560]
     np.testing.assert_allclose(frame.harm, np.array(harm) / 500)
-
-
-def test_only_what_is_of_the_arm_and_no_gripper_counts_as_self_contact():
-    kinds = np.array([0, GRIPPER, GRIPPER, LINK, LINK])
-    pairs = np.array([(0, 3), (1, 2), (1, 3), (3, 4), (0, 1)], np.int32)
-    assert self_contacts(pairs, kinds) == 2
 
 
 class CostlyVector(DummyVecEnv):

@@ -11,26 +11,22 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
-import numpy as np
 import pandas as pd
 import torch
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import VectorEnv
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.envs.vector import ThreadedVectorEnv, cores
+from asm_gym.envs.vector import cores
 from asm_gym.files import write_text
 from asm_gym.guard.responses import CAUSES, PRESSING
 from asm_gym.rollouts.executed_sac import ExecutedSAC
@@ -40,15 +36,12 @@ from asm_gym.rollouts.priced_cost import Lagrangian, PricedCost
 from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit, learning_tables
-from asm_gym.tasks import ROBOTS, env_id
+from asm_gym.scripts.reproduce.learning_scenes import REACH, TASKS, SpeedLimited, vector
+from asm_gym.tasks import ROBOTS
 from asm_gym.wrappers import VectorNeuralASMSafety
-from asm_gym.wrappers.env_attributes import askable
 
 ALONE = "alone"
 DEFAULT = "default"
-REACH = "Reach"
-TASKS = ("Lift", "Door", "Stack", REACH)
-REACHED = 0.03  # a hand so near to the cube has reached it [m]
 SLOW = 0.15  # of the fixed speed limit [m/s]
 GOING_ON = {cause: "go on" for cause in CAUSES if not cause.endswith(PRESSING)}
 
@@ -176,67 +169,7 @@ def runs(config: Config) -> list[Run]:
     return found
 
 
-# ------------------------------------------------------------------ environments
-
-
-class Reach(gym.Wrapper[Any, Any, Any, Any]):
-    """Lift's scene, in which the hand is to move to the cube and needs to lift nothing."""
-
-    def step(self, action: Any) -> Any:
-        observation, _, terminated, truncated, info = self.env.step(action)
-        arm: Any = self.unwrapped
-        scene = arm.robosuite_env
-        distance = scene._gripper_to_target(
-            gripper=scene.robots[0].gripper,
-            target=scene.cube.root_body,
-            target_type="body",
-            return_distance=True,
-        )
-        info["success"] = bool(distance < REACHED)
-        reward = 1.0 - np.tanh(10.0 * distance)
-        return observation, float(reward), terminated, truncated, info
-
-
-class SpeedLimited(VectorWrapper):
-    """A fixed limit of the hands' speed, which neither a memory nor a force lowers.
-
-    Args:
-        env: a vector of this package's environments.
-        hand_speed: the limit [m/s].
-    """
-
-    def __init__(self, env: VectorEnv[Any, Any, Any], hand_speed: float) -> None:
-        super().__init__(env)
-        self._limits = ContactLimits(
-            wrist_force=math.inf,
-            external_torque=math.inf,
-            hand_speed=hand_speed,
-            stays=False,
-        )
-
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        result = self.env.reset(seed=seed, options=options)
-        named_limits = [("speed limit", self._limits)] * self.num_envs
-        askable(self.env).set_attr("limits_of_guard", named_limits)
-        return result
-
-
-def member(task: str, robot: str) -> gym.Env[Any, Any]:
-    """Return one environment of a task of this study."""
-    if task == REACH:
-        return Reach(gym.make(env_id("Lift"), robot=robot))
-    return gym.make(env_id(task), robot=robot)
-
-
-@contextmanager
-def vector(task: str, robot: str, count: int, threads: int) -> Iterator[ThreadedVectorEnv]:
-    """Make a vector of a task, and close it when the block ends."""
-    make = partial(member, task, robot)
-    envs = ThreadedVectorEnv([make] * count, threads, AutoresetMode.DISABLED)
-    try:
-        yield envs
-    finally:
-        envs.close()
+# ------------------------------------------------------------------ one run
 
 
 def recorded(envs: VectorEnv[Any, Any, Any], way: Way) -> LearningRecord:
@@ -246,9 +179,6 @@ def recorded(envs: VectorEnv[Any, Any, Any], way: Way) -> LearningRecord:
     if way.guard is not None:
         envs = VectorNeuralASMSafety(envs, **way.guard)
     return LearningRecord(envs)
-
-
-# ------------------------------------------------------------------ one run
 
 
 class Learner(NamedTuple):

@@ -1,0 +1,55 @@
+"""What wears an arm: contact force over time, joints at their stops, and a robot that touches itself."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import asm_gym  # noqa: F401
+from asm_gym.envs.wear import AT_STOP, GRIPPER, LINK, self_contacts
+from asm_gym.policies import make_policy, rollout
+
+DOWN = np.array([0, 0, -1, 0, 0, 0, 1], np.float32)
+
+
+def test_only_what_is_of_the_arm_and_no_gripper_counts_as_self_contact():
+    kinds = np.array([0, GRIPPER, GRIPPER, LINK, LINK])
+    pairs = np.array([(0, 3), (1, 2), (1, 3), (3, 4), (0, 1)], np.int32)
+    assert self_contacts(pairs, kinds) == 2
+
+
+@pytest.mark.parametrize("stream_freq", [None, 100])
+def test_the_impulse_is_the_force_beyond_forty_newtons_in_every_substep(stream_freq):
+    env = gym.make("asm_gym/Lift-v0", stream_freq=stream_freq)
+    arm = env.unwrapped
+    forces = []
+    _, info = env.reset(seed=0)
+    assert info["contact_impulse"] == 0.0
+    arm.substep_hooks.append(lambda _: forces.append(arm.simulation.contact_forces[-1]))
+    reported = sum(env.step(DOWN)[-1]["contact_impulse"] for _ in range(25))
+    expected = np.maximum(np.array(forces) - 40.0, 0.0).sum() / 500
+    assert expected > 1.0  # it rams the table
+    assert reported == pytest.approx(expected)
+    env.close()
+
+
+def test_a_joint_at_its_stop_counts():
+    env = gym.make("asm_gym/Lift-v0")
+    env.reset(seed=0)
+    simulation = env.unwrapped.simulation
+    assert simulation.wear.read() == (0, 0)
+    joint = env.unwrapped.robosuite_env.robots[0]._ref_joint_indexes[1]
+    simulation.data.qpos[simulation.model.jnt_qposadr[joint]] = (
+        simulation.model.jnt_range[joint, 1] - 0.5 * AT_STOP
+    )
+    assert simulation.wear.read().joint_stops == 1
+    env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["Panda", "Sawyer", "IIWA", "UR5e", "Kinova3", "Jaco"])
+def test_a_robot_that_lifts_as_the_expert_does_not_touch_itself(robot):
+    env = gym.make("asm_gym/Lift-v0", robot=robot)
+    seen = []
+    rollout(env, make_policy("scripted", env, seed=0), 0, seen.append)
+    assert sum(info["self_contacts"] for info in seen) == 0
+    env.close()
