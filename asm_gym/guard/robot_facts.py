@@ -97,18 +97,21 @@ class RobotFacts:
         executed = rows[:, self.efference]
         return np.where(np.isfinite(executed), executed, commanded)
 
-    def slowed(self, commanded: NDArray[np.float32], executed: NDArray[np.float32]) -> float:
-        """Return the greatest share that was taken from a number of an action; NaN where unknown.
+    def slowed(
+        self, commanded: NDArray[np.float32], executed: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """Return (n,) the greatest share that was taken from a number of an action; NaN where unknown.
 
         Args:
-            commanded: (A,) the action that was commanded.
-            executed: (A,) the action that was executed.
+            commanded: (n, A) the actions that were commanded.
+            executed: (n, A) the actions that were executed.
         """
         if self.limits_contact and self.efference is None:  # a wrapper inside changes actions
-            return np.nan
+            return np.full(len(commanded), np.nan)
         moved = np.abs(commanded) > SMALLEST
-        shares = 1.0 - executed[moved] / commanded[moved]
-        return float(np.nan_to_num(shares).clip(0.0, 1.0).max(initial=0.0))
+        left = np.ones(commanded.shape)  # share of each number
+        np.divide(executed, commanded, out=left, where=moved)
+        return np.nan_to_num(1.0 - left).clip(0.0, 1.0).max(axis=1, initial=0.0)
 
     @classmethod
     def unknown(cls, spec: StreamSpec, observed: NDArray[np.bool_] | None = None) -> Self:

@@ -118,10 +118,11 @@ def of_each(infos: dict[str, Any], count: int) -> list[dict[str, Any]]:
     members = [{name: values[n] for name, values in arrays.items()} for n in range(count)]
     asm = infos.get("asm")
     if asm is not None:
-        executed = asm["executed_action"]
+        known = dict.copy(asm)  # without the rest, which ``asm`` makes when it is read
         for n, member in enumerate(members):
             member["asm"] = LazyInfo(partial(_of_member, asm, n))
-            member["asm"]["executed_action"] = executed[n]
+            for name, values in known.items():
+                member["asm"][name] = _of_member(values, n)
     return members
 
 

@@ -167,7 +167,10 @@ class Guarding:
             "cost": alarm.astype(np.float64),
             "cost_sum": self._alarms.astype(np.float64),
         }
-        self._write(target, LazyInfo(self._describe(reports)), numbers)
+        asm = LazyInfo(self._describe(reports))
+        # Learners read it in every step: it is there without the rest.
+        asm["threshold"] = reports[-1].robots["threshold"].copy()
+        self._write(target, asm, numbers)
 
     def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
         """Write ``info["asm"]``, and numbers (n,) by name, to the ``info`` of a step."""

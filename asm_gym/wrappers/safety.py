@@ -245,6 +245,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         return bool(command.overridden[0])
 
     def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
+        asm["threshold"] = float(asm["threshold"][0])
         target["asm"] = asm
         for name, values in numbers.items():
             target[name] = values[0]
@@ -338,7 +339,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             if commanded is not None and self._box is not None:
                 flat = commanded.reshape(1, -1)
                 executed = facts.executed_in(rows, flat).reshape(commanded.shape)
-                slowed = facts.slowed(commanded.ravel(), executed.ravel())
+                slowed = float(facts.slowed(flat, executed.reshape(1, -1))[0])
             return asm_info(reports, 0, spec, executed, slowed=slowed, **step)
 
         return describe

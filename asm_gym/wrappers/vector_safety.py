@@ -234,8 +234,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         return observations, rewards, *ends, infos
 
     def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
-        # Learners read the executed action in every step: it is there without the rest.
         asm["executed_action"] = self._executed.reshape(self.env.action_space.shape or ()).copy()
+        asm["slowed"] = self._facts.slowed(self._commanded, self._executed)
         for name, values in {"asm": asm, **numbers}.items():
             target[name] = values
             target[f"_{name}"] = self._present  # Gymnasium's mask of the members that it tells of
@@ -295,19 +295,11 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         return report
 
     def _describe(self, reports: Sequence[RowReport]) -> Callable[[], dict[str, Any]]:
-        facts = self._facts
         spec = self.monitor.spec
-        commanded = self._commanded.copy()
-        executed = self._executed.copy()
         step: dict[str, Any] = {"alarms": self._alarms.copy()}
         for name, value in self._running_threshold().items():
             step[name] = np.full(self.num_envs, value)
-
-        def describe() -> dict[str, Any]:
-            slowed = [facts.slowed(*pair) for pair in zip(commanded, executed, strict=True)]
-            return side_by_side(reports[-1], spec, slowed=np.array(slowed), **step)
-
-        return describe
+        return lambda: side_by_side(reports[-1], spec, **step)
 
 
 def _with(batch: Any, i: int, value: Any) -> Any:
