@@ -72,7 +72,8 @@ def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
     if study in (
         "harm",
         "chunks",
-    ):  # which count episodes; the others have means over seeds and a figure
+        "learning",
+    ):  # which count episodes or have intervals; the others have means ± deviations and a figure
         assert rows
         assert "|" in table
     else:
