@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -131,7 +131,7 @@ class Run:
     steps: int
     envs: int
     evaluation_episodes: int
-    threads: int = field(default=1)
+    threads: int = 1
 
     @property
     def key(self) -> kit.Record:

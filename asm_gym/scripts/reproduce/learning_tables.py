@@ -40,22 +40,23 @@ def findings(results: Sequence[Record], paces: Sequence[Record]) -> kit.Findings
 def summary(result: Record) -> Record:
     """Return one row of numbers of a run, which its file holds."""
     episodes = pd.DataFrame(result["learning"])
-    steps = float(episodes.length.sum())
-    hours = steps * result["period"] / 3600.0
+    total = episodes.sum()
+    per_step = total / total.length
+    hours = total.length * result["period"] / 3600.0
     first = episodes[episodes.step <= FIFTH * result["steps"]]
     last = episodes[episodes.step > (1.0 - FIFTH) * result["steps"]]
     row = {name: result[name] for name in (*CELL, "seed")} | {
         "kind": "run",
         "episodes": len(episodes),
-        "harm": episodes.harm.sum(),
-        "harm_hour": episodes.harm.sum() / hours,
-        "blows": episodes.blows.sum(),
+        "harm": total.harm,
+        "harm_hour": total.harm / hours,
+        "blows": total.blows,
         "peak": episodes.peak.max(),
-        "overridden": episodes.overridden.sum() / steps,
-        "slowed": episodes.slowed.sum() / steps,
-        "cost": episodes.cost.sum() / steps,
-        "joint_stops": 1000.0 * episodes.joint_stops.sum() / steps,
-        "self_contacts": 1000.0 * episodes.self_contacts.sum() / steps,
+        "overridden": per_step.overridden,
+        "slowed": per_step.slowed,
+        "cost": per_step.cost,
+        "joint_stops": 1000.0 * per_step.joint_stops,
+        "self_contacts": 1000.0 * per_step.self_contacts,
         "first_reward": first.reward.mean(),
         "last_reward": last.reward.mean(),
         "last_success": last.success.mean(),
