@@ -2,8 +2,8 @@
 
 PPO and SAC of stable-baselines3 learn four motions alone, under guards, and with the cost of alarms in the reward.
 Harm is the contact force on the arm beyond 40 N, summed over all physics substeps of learning [N s], from the
-simulator. Every run has a file of its own: the same command continues after a kill. A run of 40,960 steps takes about
-two minutes of one core, the whole study about eight hours of two.
+simulator. Every run has a file of its own: the same command continues after a kill. A run of PPO takes about two
+minutes of one core, the whole study some seven hours of two, by estimate.
 """
 
 from __future__ import annotations
