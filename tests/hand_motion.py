@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from asm_gym.envs.controllers import REACHES
+from asm_gym.envs.arm_brake import REACHES
 
 
 def hand_jacobian(simulation, arm):
@@ -31,15 +31,35 @@ def hand_speed(twist):
     return np.linalg.norm(twist[:3]) + REACHES * np.linalg.norm(twist[3:])
 
 
+def stopping_impulse(simulation, body, place, velocity):
+    """Return |Λ v| of a place of a body, Λ⁻¹ = J M⁻¹ Jᵀ [N s]."""
+    model, data = simulation.model, simulation.data
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, place.copy(), int(body))
+    mass = np.zeros((model.nv, model.nv))
+    rows = np.repeat(np.arange(model.nv), model.M_rownnz)
+    mass[rows, model.M_colind] = mass[model.M_colind, rows] = data.M
+    inverse = jacobian @ np.linalg.solve(mass, jacobian.T)
+    return np.linalg.norm(np.linalg.solve(inverse + 1e-3 * np.eye(3), velocity))
+
+
 def hand_momentum(simulation, arm, twist):
-    """Return m |v|, by the reflected mass 1/m = nᵀ J M⁻¹ Jᵀ n along n = v/|v| [N s]."""
-    jacobian = hand_jacobian(simulation, arm)[:3]
-    mass = np.zeros((simulation.model.nv, simulation.model.nv))
-    rows = np.repeat(np.arange(simulation.model.nv), simulation.model.M_rownnz)
-    columns = simulation.model.M_colind
-    mass[rows, columns] = mass[columns, rows] = simulation.data.M
-    speed = np.linalg.norm(twist[:3])
-    if speed == 0.0:
-        return 0.0
-    along = twist[:3] / speed
-    return speed / (along @ jacobian @ np.linalg.solve(mass, jacobian.T) @ along)
+    """Return |Λ v| of the hand in a motion, a twist (6,) [N s]."""
+    site = simulation.arms.site[arm]
+    place = simulation.data.site_xpos[site]
+    return stopping_impulse(simulation, simulation.arms.site_body[arm], place, twist[:3])
+
+
+def link_momentum(simulation, arm):
+    """Return the largest |Λ v| of the origins of an arm's links, and of its hand [N s]."""
+    model, data = simulation.model, simulation.data
+    hardest = hand_momentum(simulation, arm, present_twist(simulation, arm))
+    for link in simulation.arms.links[arm, 1:]:
+        if link < 0:
+            break
+        place = data.xpos[link]
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, place.copy(), int(link))
+        velocity = jacobian @ data.qvel
+        hardest = max(hardest, stopping_impulse(simulation, link, place, velocity))
+    return hardest

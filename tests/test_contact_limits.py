@@ -217,7 +217,7 @@ def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_heal
     elsewhere = HandSpeedMap(np.array([[0, 20, 20, 20, *[0.1] * 12]]))
     forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
     assert most(forward, elsewhere)[0] < 1.2 * MOMENTUM < most(forward, None)[0] / 1.5
-    assert most(sideways, elsewhere)[1] == pytest.approx(most(sideways, None)[1], rel=0.05)
+    assert most(sideways, elsewhere)[1] > 2.0 * most(forward, elsewhere)[1]
 
 
 def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():

@@ -7,25 +7,28 @@ import pytest
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed import cell_near
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.envs.speed_limit import BESIDE_BASE
+from asm_gym.envs.arm_brake import BESIDE_BASE
 from asm_gym.monitors import NeuralASM
-from tests.hand_motion import hand_momentum, hand_speed, joint_twist, present_twist
+from tests.hand_motion import hand_momentum, hand_speed, joint_twist
 
 STILL = 1e-9
 SLACK = np.array([0.03, 0.03, 0.03, 0.15, 0.15, 0.15])
 
 
-def share_of(limits, arm, place, twist, speed, momentum):
+def share_of(limits, arm, place, twist, momentum, upright=1.0):
     """Return the share that a hand may have of a motion."""
-    usual = limits.hand_speed / max(speed, STILL)
-    if limits.pace is None:
+    own = limits.speed_limit()
+    usual = min(
+        limits.hand_speed / max(hand_speed(twist), STILL), own.momentum / max(momentum, STILL)
+    )
+    if limits.pace is None or upright < limits.pace.least_upright:
         return usual
     along, against = limits.pace.fastest_near(arm, place).astype(float)
     healthy = 1.25 * np.where(twist > 0.0, along, against) + SLACK
     known = (healthy / np.maximum(np.abs(twist), STILL)).min()
     down = min(max(1.05 * against[2], 0.03), limits.hand_speed)
     known = min(known, down / max(-twist[2], STILL))
-    return max(min(usual, limits.pace.momentum / max(momentum, STILL)), known)
+    return max(usual, known)
 
 
 def asked_twist(env, arm, action):
@@ -57,23 +60,18 @@ def slowed(env, action, limits):
         base = simulation.data.xpos[simulation.arms.root[arm]]
         own = limits
         if np.linalg.norm((place - base)[:2]) < BESIDE_BASE:
-            own = ContactLimits(hand_speed=limits.hand_speed / 2)
+            momentum = limits.speed_limit().momentum / 2
+            own = ContactLimits(hand_speed=limits.hand_speed / 2, momentum=momentum)
         brakes.append(own.hand_speed)
         if controller.name == "IK_POSE":
             continue
-        asked, present = asked_twist(env, arm, action), present_twist(simulation, arm)
-        shares = [
-            share_of(
-                own, arm, place, twist, hand_speed(twist), hand_momentum(simulation, arm, twist)
-            )
-            for twist in (asked, present)
-        ]
-        most = hand_speed(asked) * shares[0]
-        if shares[1] < 1.0:
-            most = min(most, hand_speed(present) * shares[1])
-        brakes[-1] = max(own.hand_speed, most)
-        if shares[0] < 1.0:
-            action[part] *= shares[0]  # an action of 0 changes nothing
+        asked = asked_twist(env, arm, action)
+        upright = -simulation.data.site_xmat[simulation.arms.site[arm], 8]
+        momentum = hand_momentum(simulation, arm, asked)
+        share = share_of(own, arm, place, asked, momentum, upright)
+        brakes[-1] = max(own.hand_speed, hand_speed(asked) * share)
+        if share < 1.0:
+            action[part] *= share  # an action of 0 changes nothing
     return action, np.array(brakes)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.hand_speed import Floats, SpeedLimit, allowed_share
+from asm_gym.detection.hand_speed import NO_SPEED_LIMIT, Floats, SpeedLimit, allowed_share
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
@@ -34,14 +34,7 @@ LEANS_S = 0.5
 """More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
 did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
-STRICTEST = ("wrist_force", "external_torque", "hand_speed")  # the smaller the stricter
-
-_NO_MAP = SpeedLimit(
-    grid=np.zeros((0, 1, 1, 1, 12), np.float32),
-    low=np.zeros(4, np.int64),
-    hand_speed=np.inf,
-    momentum=np.inf,
-)
+STRICTEST = ("wrist_force", "external_torque", "hand_speed", "momentum")  # the smaller the stricter
 
 
 @dataclass(frozen=True)
@@ -54,6 +47,7 @@ class ContactLimits:
         hand_speed: of the hand, and of points 0.15 m from its fingers as it turns [m/s]; infinite for no limit.
             Under OSC_POSE, OSC_POSITION and JOINT_POSITION a faster command is scaled down. Under every controller a
             brake slows an arm that is still too fast.
+        momentum: of each link, the impulse that stops it [N s]; that of ``pace`` counts too. Infinite for no other.
         healthy: largest values in healthy motion of this body and task, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; a larger one replaces the limit. Empty if unknown.
         pace: higher speeds where healthy hands were faster; None for no such places.
@@ -66,6 +60,7 @@ class ContactLimits:
     wrist_force: float = 80.0
     external_torque: float = 40.0
     hand_speed: float = 0.15
+    momentum: float = np.inf
     healthy: tuple[float, ...] = ()
     pace: HandSpeedMap | None = None
     stays: bool = True
@@ -99,12 +94,20 @@ class ContactLimits:
         return np.maximum(limits, self.healthy)
 
     def reduced(self, force_share: float, hand_speed: float) -> ContactLimits:
-        """Return limits with a share of the limits on forces, and a hand speed of at most ``hand_speed`` [m/s]."""
+        """Return limits with a share of the limits on forces, and a hand speed of at most ``hand_speed`` [m/s].
+
+        Momentum is reduced as speed is; pace no longer counts.
+        """
+        slower = min(hand_speed, self.hand_speed)
+        momentum = self.speed_limit().momentum
+        if np.isfinite(self.hand_speed):
+            momentum *= slower / self.hand_speed
         return replace(
             self,
             wrist_force=force_share * self.wrist_force,
             external_torque=force_share * self.external_torque,
-            hand_speed=min(hand_speed, self.hand_speed),
+            hand_speed=slower,
+            momentum=momentum,
             healthy=tuple(force_share * value for value in self.healthy),
             pace=None,
         )
@@ -125,11 +128,18 @@ class ContactLimits:
 
     def speed_limit(self) -> SpeedLimit:
         """Return the limits of the hands' speed, as compiled code reads them."""
-        limit = _NO_MAP._replace(hand_speed=float(self.hand_speed))
+        limit = NO_SPEED_LIMIT._replace(
+            hand_speed=float(self.hand_speed), momentum=float(self.momentum)
+        )
         if self.pace is None:
             return limit
-        momentum = float(self.pace.momentum)
-        return limit._replace(grid=self.pace.grid, low=self.pace.low, momentum=momentum)
+        momentum = min(limit.momentum, float(self.pace.momentum))
+        return limit._replace(
+            grid=self.pace.grid,
+            low=self.pace.low,
+            momentum=momentum,
+            least_upright=self.pace.least_upright,
+        )
 
     def share(
         self, arm: int, place: Floats, twist: Floats, speed: float, momentum: float = 0.0

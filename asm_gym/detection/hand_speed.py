@@ -2,11 +2,12 @@
 
 Near a place where healthy hands went at most as fast as g along each axis, a hand may make the share s of a motion v:
 
-    s = max(min(L / |v|, P / (m |v|)), k),      k = min_i (1.25 g_i + slack_i) / |v_i|
+    s = max(min(L / |v|, P / p), k),      k = min_i (1.25 g_i + slack_i) / |v_i|
 
 v (6,) is a twist, linear then angular [m/s], [rad/s]; |v| the speed of the hand's fastest point [m/s], and L its usual
-limit; m the arm's reflected mass along the motion [kg], and P the limit of its momentum [N s]. Downwards, where what a
-hand meets is hard, k allows at most L, and at most 1.05 times the speed of healthy hands.
+limit; p the momentum of the arm behind it, and P its limit [N s]. Downwards, where what a
+hand meets is hard, k allows at most L, and at most 1.05 times the speed of healthy hands. In tasks whose healthy hands
+point down all the time, k counts only for hands that do so: one that is tilted meets things with other parts.
 """
 
 from __future__ import annotations
@@ -40,6 +41,16 @@ class SpeedLimit(NamedTuple):
     low: NDArray[np.int64]  # (4,) arm and place of the grid's first cell
     hand_speed: float  # the usual limit [m/s]
     momentum: float  # the limit where no healthy hand was [N s]
+    least_upright: float  # cosine of the greatest tilt of a hand that goes as fast as healthy ones
+
+
+NO_SPEED_LIMIT = SpeedLimit(
+    grid=np.zeros((0, 1, 1, 1, 2 * AXES), np.float32),
+    low=np.zeros(4, np.int64),
+    hand_speed=np.inf,
+    momentum=np.inf,
+    least_upright=-1.0,
+)
 
 
 @compiled
@@ -78,6 +89,13 @@ def healthy_share(limit: SpeedLimit, arm: int, place: Floats, twist: Floats) -> 
 
 
 @compiled
+def usual_share(limit: SpeedLimit, speed: float, momentum: float) -> float:
+    """Return the share that a hand may have of a motion where no healthy hand was; see ``allowed_share``."""
+    share = limit.hand_speed / max(speed, LEAST_SPEED)
+    return min(share, limit.momentum / max(momentum, LEAST_SPEED))
+
+
+@compiled
 def allowed_share(
     limit: SpeedLimit,
     arm: int,
@@ -94,10 +112,9 @@ def allowed_share(
         place: (3,) of the hand [m].
         twist: (6,) of the hand, linear and angular [m/s], [rad/s].
         speed: of the hand's fastest point [m/s].
-        momentum: of the arm along its hand's motion [N s]; 0 where it is not known.
+        momentum: of the arm in its motion [N s]; 0 where it is not known.
     """
-    share = limit.hand_speed / max(speed, LEAST_SPEED)
+    share = usual_share(limit, speed, momentum)
     if limit.grid.size == 0:
         return share
-    share = min(share, limit.momentum / max(momentum, LEAST_SPEED))
     return max(share, healthy_share(limit, arm, place, twist))

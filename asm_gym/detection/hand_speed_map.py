@@ -35,9 +35,13 @@ FASTEST_EPISODES = 0.05
 ODD_EPISODES = 0.002
 """and of all episodes: of hundreds, an odd one sets no speed where few others go."""
 
-MOMENTUM = 1.5
-"""Limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]."""
-MOMENTUM_OF_KNOWN_TASK = 1.35  # the same in a task with a map of its own [N s]
+MOMENTUM = 2.0
+"""Limit of a hand or link where no healthy hand was: 13 kg at the usual speed [N s]. MuJoCo's contacts answer with at
+most 105/s times that."""
+
+TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
+TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
+LEAST_UPRIGHT = 0.9  # other hands point down to within 26 degrees
 
 
 class HandSpeedMap:
@@ -45,7 +49,7 @@ class HandSpeedMap:
 
     Args:
         cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
-        momentum: limit of an arm's momentum along its hand's motion, where no healthy hand was [N s].
+        momentum: limit of the momentum of an arm's hand and links, where no healthy hand was [N s].
 
     Raises:
         ValueError: cells of another shape, places that are too far away, or negative speeds.
@@ -53,6 +57,7 @@ class HandSpeedMap:
     Attributes:
         grid: (arms, x, y, z, 12) the greatest speeds of healthy hands in each cell and its neighbours.
         low: (4,) arm and place of the grid's first cell.
+        least_upright: cosine of the greatest tilt at which a hand may go as fast as healthy ones did.
     """
 
     def __init__(
@@ -76,6 +81,11 @@ class HandSpeedMap:
         at = tuple(offsets.T)
         np.maximum.at(grid, at, cells[:, FASTEST_COLUMNS])
 
+        tilting = cells[:, FASTEST_COLUMNS][:, TILTING].max(axis=1)
+        self.least_upright = LEAST_UPRIGHT
+        if np.median(tilting) > TILTED_SPEED:
+            self.least_upright = -1.0
+
         # A hand may go as fast as others beside its cell; downwards, only as others at its height.
         downward = grid[..., DOWNWARDS]
         self.grid = maximum_filter(grid, (1, 3, 3, 3, 1))
@@ -89,7 +99,7 @@ class HandSpeedMap:
     ) -> Self | None:
         """Return the map of a task; that of all tasks where it has none, None where there are no cells."""
         if task and task in cells_by_task:
-            return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK)
+            return cls(cells_by_task[task])
         if not cells_by_task:
             return None
         return cls(np.concatenate(list(cells_by_task.values())))

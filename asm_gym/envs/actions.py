@@ -59,7 +59,8 @@ class Actions:
 
     def slowed(self, action: Action, limits: ContactLimits) -> Action:
         """Return the action (A,) scaled along its own direction so that no point of a hand goes faster than it may."""
-        return self._limiter.slowed(action, limits)
+        self._simulation.limit_motion(limits)
+        return self._limiter.slowed(action, self._simulation.motion_limits)
 
     def resting(self, last: Action) -> Action:
         """Return the action (A,) that changes nothing, where there is one, with the grippers as in ``last``."""

@@ -94,6 +94,7 @@ def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
     arm.qpos[:joints] = robot._ref_joint_pos_indexes
     arm.dofs[:joints] = robot._ref_joint_vel_indexes
     arm.motors[:joints] = robot._ref_actuators_indexes_dict[name]
+    arm.gears[:joints] = model.actuator_gear[arm.motors[:joints], 0]
     arm.site = robot.eef_site_id[name]
     arm.site_body = model.site_bodyid[arm.site]
     arm.root = model.body_rootid[arm.site_body]
@@ -102,7 +103,9 @@ def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
     own = bodies(model, robot)
     hand = model.body(robot.robot_model.eef_name[name]).id
     _fill(arm.bodies, own[model.body_weldid[own] != 0])
-    _fill(arm.links, _links(model, hand))
+    links = _links(model, hand)
+    _fill(arm.links, links)
+    _fill(arm.link_joints, _joints_that_move(model, links, arm.dofs[:joints]))
     _fill(arm.tree_dofs, _carried_dofs(model, robot))
 
     sensors = robot.gripper[name].important_sensors
@@ -147,6 +150,15 @@ def _links(model: mujoco.MjModel, hand: int) -> Ints:
         links.append(parent)
         parent = int(model.body_parentid[parent])
     return np.array(links, np.int64)
+
+
+def _joints_that_move(model: mujoco.MjModel, links: Ints, dofs: Ints) -> Ints:
+    """Return how many of an arm's joints, of degrees of freedom ``dofs``, move each of its links."""
+    counts = np.zeros(len(links), np.int64)
+    for dof in dofs:
+        first = np.flatnonzero(links == model.dof_bodyid[dof])[0]
+        counts[: first + 1] += 1
+    return counts
 
 
 def _carried_dofs(model: mujoco.MjModel, robot: Any) -> Ints:

@@ -20,8 +20,16 @@ from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, compiled, inner
+from asm_gym.envs.arm_brake import slow_down
 from asm_gym.envs.controller_inputs import within
-from asm_gym.envs.controllers import HELD, control, length, read_arm, set_goal, slow_down
+from asm_gym.envs.controllers import (
+    HELD,
+    control,
+    length,
+    note_strengths,
+    read_arm,
+    set_goal,
+)
 from asm_gym.envs.mujoco_views import (
     FELT,
     JOINTS,
@@ -199,7 +207,7 @@ def evaluate_nominal(views: Views, nominal: NominalViews) -> None:
     _evaluate_nominal(views, nominal)
 
 
-@compiled
+@partial(compiled, calls=("detection",))
 def brake_beneath(
     views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, limits: SubstepLimits
 ) -> None:
@@ -209,10 +217,10 @@ def brake_beneath(
             control(views, nominal, arms[a], goals[a], work)
         else:
             read_arm(views, nominal, arms[a], work)
-            limits.status[0].braked += slow_down(views, arms[a], limits.speed_limits[a], work)
+            limits.status[0].braked += slow_down(views, arms[a], goals[a], a, limits, work)
 
 
-@partial(compiled, nogil=True)
+@partial(compiled, nogil=True, calls=("detection",))
 def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
     """Run ``count`` physics substeps, controllers and sensors included.
 
@@ -234,9 +242,10 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
             goal = goals[a]
             if fresh and k == first and goal.held == 0:
                 set_goal(views, arm, goal, action, work)
+            note_strengths(views, arm, goal)
             control(views, nominal, arm, goal, work)
             if goal.held == 0:
-                limits.status[0].braked += slow_down(views, arm, limits.speed_limits[a], work)
+                limits.status[0].braked += slow_down(views, arm, goal, a, limits, work)
         _step2(views.model, views.data)
         # the place for all that is measured in every substep
         sample(views, nominal, arms, k, samples)

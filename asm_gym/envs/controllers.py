@@ -48,8 +48,8 @@ HELD = 1  # to be held from the next substep on
 BRAKING = 2  # on its way to rest
 YIELDING = 3  # since it came to rest
 
-REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
-SLOWING = 200.0  # share of the speed beyond its limit that an arm loses in a second [1/s]
+LEAST_TORQUE = 1.0  # a smaller command does not tell how strong its motor is [N m]
+WEAKEST = 0.2  # a motor is commanded at most the inverse of it times its torque
 RESTING = 0.1  # an arm none of whose joints is faster than this has come to rest [rad/s]
 YIELD_LEVER = 0.15  # r₀: the least lever of a joint [m]
 
@@ -132,6 +132,16 @@ def rotate(R: Floats, frame: Floats, product: Floats) -> None:
             for k in range(3):
                 entry += R[i, k] * frame[k, j]
             product[i, j] = entry
+
+
+@partial(inner, inlined=True)
+def note_strengths(views: Views, arm: Arm, goal: Goal) -> None:
+    """Note which share of its last command each motor has delivered."""
+    for i in range(arm.joint_count):
+        commanded = arm.gears[i] * views.ctrl[arm.motors[i]]
+        if abs(commanded) > LEAST_TORQUE:
+            share = views.qfrc_actuator[arm.dofs[i]] / commanded
+            goal.strengths[i] = within(share, WEAKEST, 1.0)
 
 
 @partial(inner, inlined=True)
@@ -375,29 +385,6 @@ def read_pose_error(views: Views, arm: Arm, goal: Goal, error: Floats) -> None:
         error[3 + i] = 0.5 * turn
 
 
-@partial(inner, inlined=True)
-def fastest_point(views: Views, arm: Arm) -> float:
-    """Return the greatest speed of any point within ``REACHES`` of the hand or of a link's origin [m/s]."""
-    origin = views.subtree_com[arm.root]  # at which MuJoCo's velocities of bodies are
-    hand = arm.links[0]
-    fastest = point_speed(views.cvel[hand], views.site_xpos[arm.site], origin)
-    n = 1
-    while arm.links[n] >= 0:
-        link = arm.links[n]
-        speed = point_speed(views.cvel[link], views.xpos[link], origin)
-        fastest = max(fastest, speed)
-        n += 1
-    return fastest
-
-
-@inner
-def point_speed(motion: Floats, place: Floats, origin: Floats) -> float:
-    """Return how fast the furthest point about a place (3,) may go [m/s]; see ``velocity_at``."""
-    x, y, z = velocity_at(motion, place, origin)
-    speed = np.sqrt(x * x + y * y + z * z)
-    return speed + REACHES * length(motion[:3])
-
-
 @inner
 def length(vector: Floats) -> float:
     """Return the length of three numbers."""
@@ -405,31 +392,6 @@ def length(vector: Floats) -> float:
     y = vector[1]
     z = vector[2]
     return np.sqrt(x * x + y * y + z * z)
-
-
-@partial(inner, inlined=True)
-def slow_down(views: Views, arm: Arm, speed_limit: float, work: Work) -> bool:
-    """Brake an arm along its own motion while its fastest point passes its limit [m/s].
-
-    Mass and velocities of ``work`` are those of the arm.
-
-    Returns:
-        Whether the arm is braked.
-    """
-    if speed_limit == np.inf:
-        return False
-    speed = fastest_point(views, arm)
-    if not speed > speed_limit:
-        return False
-
-    excess = 1.0 - speed_limit / speed
-    for i in range(arm.joint_count):
-        work.acceleration[i] = SLOWING * excess * work.velocities[i]
-    multiply(work.mass, arm.joint_count, work.acceleration, work.torques)
-    for i in range(arm.joint_count):
-        motor = arm.motors[i]
-        command(views, motor, views.ctrl[motor] - work.torques[i])
-    return True
 
 
 @partial(inner, inlined=True)
@@ -450,4 +412,7 @@ def control(views: Views, nominal: NominalViews, arm: Arm, goal: Goal, work: Wor
     else:
         track_pose(views, arm, goal, work)
     for i in range(arm.joint_count):
-        command(views, arm.motors[i], work.torques[i])
+        torque = work.torques[i]
+        if goal.held:
+            torque /= goal.strengths[i]
+        command(views, arm.motors[i], torque)

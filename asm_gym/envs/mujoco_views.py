@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.hand_speed import SpeedLimit
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 JOINTS = 7  # the most joints an arm may have; shorter arms leave the rest unused
@@ -82,6 +84,7 @@ ARM = np.dtype(
         ("qpos", np.int64, JOINTS),  # the joints' places in MuJoCo's arrays
         ("dofs", np.int64, JOINTS),
         ("motors", np.int64, JOINTS),
+        ("gears", np.float64, JOINTS),  # torque that a motor delivers of a command of 1 [N m]
         ("site", np.int64),  # between the fingers
         ("site_body", np.int64),  # that the site belongs to
         ("root", np.int64),  # the robot's outermost body
@@ -89,6 +92,7 @@ ARM = np.dtype(
         ("wrench", np.int64),  # where the wrist's force and torque begin in sensordata
         ("bodies", np.int64, MOST_BODIES),  # whose contacts count; then -1
         ("links", np.int64, MOST_BODIES),  # bodies from the hand to the base; then -1
+        ("link_joints", np.int64, MOST_BODIES),  # how many of the joints move each of them
         ("tree_dofs", np.int64, MOST_BODIES),  # dofs of the arm and all that hangs on it; then -1
         ("controller", np.int64),  # OSC_POSE or JOINT_POSITION
         ("kp", np.float64, JOINTS),
@@ -109,6 +113,7 @@ GOAL = np.dtype(
         ("orientation", np.float64, (3, 3)),
         ("joints", np.float64, JOINTS),  # [rad]
         ("anchor", np.float64, JOINTS),  # where an arm that is held is to stay [rad]
+        ("strengths", np.float64, JOINTS),  # share of its commanded torque that a motor delivered
         ("held", np.int64),  # 0, or HELD, BRAKING, YIELDING of ``controllers``
     ]
 )
@@ -142,6 +147,9 @@ class Work(NamedTuple):
     weighted: Floats  # (JOINTS, JOINTS) J L⁻ᵀ, and below it p L⁻ᵀ
     products: Floats  # (JOINTS, JOINTS) J M⁻¹ Jᵀ, and below it J M⁻¹ p
     rotations: Floats  # (3, 3, 3) frames on the way to a set-point
+    twist: Floats  # (6,) of the hand [m/s], [rad/s]
+    momentum: Floats  # (3,) of a link [N s]
+    inverse_mass: Floats  # (3, 3) a factor of that of a link [1/kg]
 
     @classmethod
     def empty(cls) -> Work:
@@ -162,6 +170,9 @@ class Work(NamedTuple):
             weighted=np.zeros(square),
             products=np.zeros(square),
             rotations=np.zeros((3, 3, 3)),
+            twist=np.zeros(6),
+            momentum=np.zeros(3),
+            inverse_mass=np.zeros((3, 3)),
         )
 
 
@@ -177,6 +188,9 @@ STATUS = np.dtype(
 """What became of the limits in a control step."""
 
 
+MotionLimits = tuple[SpeedLimit, SpeedLimit]  # of hands, and of those beside their own base
+
+
 class SubstepLimits(NamedTuple):
     """Limits of the arms' load in every substep of a control step; changed in place."""
 
@@ -186,3 +200,4 @@ class SubstepLimits(NamedTuple):
     )
     status: Any  # (1,) of STATUS
     speed_limits: Floats  # (A,) of an arm's fastest point, beyond which it is slowed down [m/s]
+    motion: MotionLimits

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, bind, must_compile
 from asm_gym.detection.contact_limits import FREE_FORCE, ContactLimits
+from asm_gym.detection.hand_speed import NO_SPEED_LIMIT
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import (
     PHYSICS_FREQ,
@@ -29,6 +30,7 @@ from asm_gym.envs.mujoco_views import (
     JOINTS,
     STATUS,
     Floats,
+    MotionLimits,
     NominalViews,
     SubstepLimits,
     Views,
@@ -69,7 +71,9 @@ class Simulation:
             load_share=np.zeros(1),
             status=records(1, STATUS),
             speed_limits=self.speed_limits,
+            motion=(NO_SPEED_LIMIT, NO_SPEED_LIMIT),
         )
+        self._motion_limits_set: ContactLimits | None = None
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.wear = WearSensor(self.parts, self.model, self.data)
         self.contact_force = 0.0
@@ -110,6 +114,7 @@ class Simulation:
         self.compiled = all(is_compilable(part) for part in self.parts)
         self.arms = describe(self.parts, self.model)
         self._goals = records(len(self.parts), GOAL)
+        self._goals.strengths[:] = 1.0
         self.controllers = [controller_of(part) for part in self.parts]
         """Robosuite's, of each arm."""
         self.moves: list[slice] = []
@@ -159,6 +164,21 @@ class Simulation:
             self._limits_set = limits
         self._limits.status.armed = True
         self._limits.status.stops = limits.stays
+
+    @property
+    def motion_limits(self) -> MotionLimits:
+        """The limits of the motion of hands, and of hands beside their own base."""
+        return self._limits.motion
+
+    def limit_motion(self, limits: ContactLimits) -> None:
+        """Slow the arms down by the speed and momentum of ``limits`` from now on."""
+        if limits is self._motion_limits_set:
+            return
+        beside_base = limits.reduced(1.0, limits.hand_speed / 2)
+        motion = limits.speed_limit(), beside_base.speed_limit()
+        self._limits = self._limits._replace(motion=motion)
+        self._motion_limits_set = limits
+        self._bound_nominal = None  # the compiled substeps have the former limits
 
     def command(self, action: Floats, hold: bool = False) -> None:
         """Give the controllers a new set-point, which they take up in the next substep.

@@ -12,7 +12,7 @@ from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import Mask
 from asm_gym.monitors import Monitor
 
-CAREFUL_SPEED = 1.0 / 3.0  # share of the speed limit that a hand has after it has pressed too hard
+CAREFUL_SPEED = 0.25  # share of the speed limit that a hand has after it has pressed too hard
 # Share of the limits on forces then; only a policy that presses anew presses as hard so soon.
 CAREFUL_FORCES = 0.5
 CAREFUL_S = 1.0  # for so long [s], counted while the policy acts

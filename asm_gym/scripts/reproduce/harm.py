@@ -9,43 +9,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from asm_gym.detection.contact_limits import FREE_FORCE, LEANS_S, ContactLimits
+from asm_gym.detection.contact_limits import FREE_FORCE, LEANS_S
 from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.evaluation.contact_harm import harm_of
 from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
-from asm_gym.monitors import NeuralASM
-from asm_gym.policies import Policy, rollout
+from asm_gym.faults.action import ActionBias
+from asm_gym.faults.actuator import WeakJoint
+from asm_gym.policies import rollout
 from asm_gym.policies.hostile import HOSTILE
-from asm_gym.rollouts.run_trials import environment, policy_for, recorded_forces, staged
-from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
+from asm_gym.rollouts.run_trials import environment, recorded_forces, staged
+from asm_gym.rollouts.trial import PASSING, Trial
 from asm_gym.scripts.command import option
-from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce import harm_search, kit
+from asm_gym.scripts.reproduce.harm_cases import (
+    CASE,
+    CONTROL_RATE,
+    ELSEWHERE,
+    GUARDS,
+    RAMMED_TASKS,
+    Case,
+    guarded,
+)
 from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.tasks import env_id
-from asm_gym.wrappers import NeuralASMSafety
 
-GUARDS: dict[str, dict[str, Any] | None] = {
-    POLICY_ALONE: None,
-    "default": {},
-    **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.1, 0.15, 0.25)},
-    "no speed limit": {"contact_limits": ContactLimits(hand_speed=np.inf)},
-    "no limits": {"contact_limits": None},
-    "hold": {"on_alarm": "hold"},
-    "terminate": {"on_alarm": "terminate"},
-}
-"""Settings of the wrapper by name; None for no wrapper."""
-RAMMED_TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")
-"""Tasks of hostile policies."""
 UNMET_TASKS = ("PickPlaceMilk", "NutAssemblyRound")
 """Tasks that the Panda's memory has not met, with healthy policies alone."""
 ALL_TASKS = (*RAMMED_TASKS, *UNMET_TASKS)
@@ -65,19 +61,16 @@ FAULT_SEVERITIES = {
 }
 """Faults under which healthy policies act too, and their severity."""
 FAULTY_TASKS = ("Lift", "Stack")
-CONTROL_RATE = 20  # rows of a memory a second [Hz]
-ELSEWHERE = (
-    RolloutConfig(robot="Sawyer"),
-    RolloutConfig(robot="IIWA"),
-    RolloutConfig(robot="Panda", stream_freq=100),
-    RolloutConfig(robot="Sawyer", stream_freq=100),
-    RolloutConfig(robot="IIWA", stream_freq=100),
-)
-"""Other arms, and another rate of the memory."""
 SLOWER = (0.5, 0.25)  # shares of the full action at which a hostile policy acts too
-AGAINST = ("hostile", "elsewhere", "faulty")
-CASE = ("kind", "task", "policy", "fault", "robot", "rate")
-"""Values that distinguish one case from another."""
+IMPAIRMENTS = {
+    "weak_joint": WeakJoint(joint=1, strength=0.3, onset=20),
+    "action_bias": ActionBias(axis=2, amount=-2.0, onset=20),
+}
+"""Faults behind the guard under which hostile policies act too."""
+IMPAIRED_TASKS = ("Lift", "PickPlaceCan")
+RAMMING = ("down", "aside and down", "forward", "ramp")
+"""Hostile policies that act with an impairment."""
+AGAINST = ("hostile", "elsewhere", "impaired", "faulty")
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 LITTLE = 1.0  # a cell with no more harm without a guard does not count [N s]
 
@@ -91,8 +84,12 @@ class Config(kit.Config):
     episodes: int = option(10, quick=1, least=0)
     """Episodes of each policy that a guard is against."""
     against: tuple[str, ...] = option(("hostile",), known=AGAINST, metavar="NAME")
-    """Which policies. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Faulty are healthy ones in
-    Lift and Stack under each kind of fault."""
+    """Which policies. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Impaired are ramming ones
+    with a weak joint, or with a bias of the action behind the guard. Faulty are healthy ones in Lift and Stack under
+    each kind of fault."""
+    search: int = option(0, least=0)
+    """Episodes of a search for the hardest contact, under each guard, with each arm in each task; nothing else is done.
+    """
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option(
@@ -101,50 +98,6 @@ class Config(kit.Config):
     """Ways to guard."""
     tasks: tuple[str, ...] = option(ALL_TASKS, quick=("Lift",), known=ALL_TASKS, metavar="TASK")
     """Tasks; in the last two there are healthy policies alone."""
-
-
-class Case(NamedTuple):
-    """One policy in one task; its trial gets a seed for each episode."""
-
-    kind: str  # "hostile", "healthy" or "faulty"
-    policy: str
-    trial: Trial
-    config: RolloutConfig = RolloutConfig(robot="Panda")
-    speed: float = 1.0  # share of the full action of a hostile policy
-
-    @property
-    def rate(self) -> int:
-        """Rows of the memory a second [Hz]."""
-        return self.config.stream_freq or CONTROL_RATE
-
-    @property
-    def memory(self) -> str:
-        """Name of the shipped memory for the arm and the rate."""
-        arm = str(self.config.robot).lower()
-        if self.rate == CONTROL_RATE:
-            return arm
-        return f"{arm}_{self.rate}hz"
-
-    @property
-    def key(self) -> Record:
-        """Values of ``CASE``."""
-        policy = self.policy
-        if self.speed != 1.0:
-            policy += f", {self.speed:g} of full speed"
-        return {
-            "kind": self.kind,
-            "task": self.trial.task,
-            "policy": policy,
-            "fault": self.trial.kind,
-            "robot": self.config.robot,
-            "rate": self.rate,
-        }
-
-    def make_policy(self, env: gym.Env[Any, Any]) -> Policy:
-        """Return the policy for the episode of the trial's seed."""
-        if self.kind == "hostile":
-            return HOSTILE[self.policy](env, self.trial.seed, self.speed)
-        return policy_for(self.policy, env, self.trial.seed)
 
 
 def cases(config: Config) -> list[tuple[Case, int]]:
@@ -162,20 +115,27 @@ def cases(config: Config) -> list[tuple[Case, int]]:
         if case.trial.task in FAULTY_TASKS:
             trial = replace(case.trial, kind=fault, severity=severity)
             faulty.append(case._replace(kind="faulty", trial=trial))
-    against = {"hostile": hostile + slower, "elsewhere": elsewhere, "faulty": faulty}
+    against = {
+        "hostile": hostile + slower,
+        "elsewhere": elsewhere,
+        "impaired": impaired_cases(hostile),
+        "faulty": faulty,
+    }
     counted = [(case, config.episodes) for name in config.against for case in against[name]]
     return counted + [(case, config.healthy) for case in healthy]
 
 
+def impaired_cases(hostile: Sequence[Case]) -> list[Case]:
+    """Return the cases of ramming policies with each impairment."""
+    impaired = []
+    for case, (name, fault) in product(hostile, IMPAIRMENTS.items()):
+        if case.policy in RAMMING and case.trial.task in IMPAIRED_TASKS:
+            trial = replace(case.trial, kind=name, faults=(fault,))
+            impaired.append(case._replace(trial=trial))
+    return impaired
+
+
 # ------------------------------------------------------------------ measurement
-
-
-def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]:
-    """Return the environment under one of ``GUARDS``."""
-    settings = GUARDS[guard]
-    if settings is None:
-        return env
-    return NeuralASMSafety(env, NeuralASM.pretrained(case.memory), **settings)
 
 
 def episode(job: tuple[Case, str]) -> Record:
@@ -208,13 +168,16 @@ def episode(job: tuple[Case, str]) -> Record:
 
 
 def run(config: Config) -> kit.Findings:
-    """Run every case on its own scenes, under every guard."""
+    """Run every case on its own scenes, under every guard; or search for the hardest contact."""
+    if config.search:
+        tasks = [task for task in config.tasks if task in RAMMED_TASKS]
+        return harm_search.run(tasks, config.guards, config.search, config)
     jobs = []
     for repetition, (case, count) in product(config.repetitions, cases(config)):
         for number, guard in product(range(count), config.guards):
             trial = replace(case.trial, seed=10_000 * repetition + 1000 + number)
             jobs.append((case._replace(trial=trial), guard))
-    records = kit.each("episodes", episode, jobs, config)
+    records = kit.resumed("episodes", episode, jobs, config)
     frame = pd.DataFrame(records)
     hostile = frame[frame.kind == "hostile"]
     healthy = frame[frame.kind == "healthy"]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -31,6 +32,7 @@ from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts import command
 from asm_gym.scripts.command import Options, option
+from asm_gym.version import __version__
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -134,6 +136,38 @@ def each(
     """Return ``[work(item) for item in items]``, by the study's workers with a progress bar."""
     with stage(label) as report:
         return parallel_map(work, items, config.workers, report)
+
+
+def resumed(
+    label: str, work: Callable[[Item], Result], items: Sequence[Item], config: Config
+) -> list[Result]:
+    """Return ``[work(item) for item in items]`` as ``each`` does; go on where a run of this version was interrupted.
+
+    Results are kept as JSON in the folder of the study, until all are there. Items are known by their repr.
+    """
+    path = config.out / f"{label} of {__version__}.jsonl"
+    kept = _kept(path)
+    missing = [item for item in items if repr(item) not in kept]
+    config.out.mkdir(parents=True, exist_ok=True)
+    each(label, partial(_work_and_keep, work, path), missing, config)
+    kept = _kept(path)
+    path.unlink(missing_ok=True)
+    return [kept[repr(item)] for item in items]
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    """Return the results that were kept, by the text of their items; a last line that is cut off is none."""
+    if not path.exists():
+        return {}
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
+    return dict(map(json.loads, lines))
+
+
+def _work_and_keep(work: Callable[[Item], Result], path: Path, item: Item) -> None:
+    """Do the work of an item, and append its result to a file."""
+    line = json.dumps([repr(item), work(item)], default=float)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{line}\n")
 
 
 def records_of(

@@ -1,0 +1,222 @@
+"""Slow an arm down beneath its controller, by how fast it moves, whatever was commanded.
+
+Of its present motion q̇ an arm may have the share s, the least of
+
+    L / fastest point                     L: the speed that its action was slowed down to
+    max(min(L₀ / |v|, P / p), k)          v: its hand's twist; see ``detection.hand_speed``
+
+where p is the largest impulse |Λ v| that stops a link, Λ⁻¹ = J M⁻¹ Jᵀ: what a link pushes with that meets something
+hard and does not slide, be it a forearm on the robot's own pedestal. Beyond that the motors slow the arm down,
+
+    τ ← τ - M (K (1 - s) + w α) q̇         α: q̇ᵀ(τ - h) / q̇ᵀ M q̇ where it is positive, what drives the motion on
+
+A motor that delivers less torque than it was commanded is commanded so much more while it brakes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from asm_gym.compilation import inner
+from asm_gym.detection.hand_speed import SpeedLimit, healthy_share, usual_share
+from asm_gym.envs.controllers import (
+    cholesky,
+    command,
+    forward,
+    inner_products,
+    length,
+    multiply,
+    solve,
+    velocity_at,
+)
+from asm_gym.envs.mujoco_views import Arm, Floats, Goal, SubstepLimits, Views, Work
+
+REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
+SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
+ALL_DRIVE = 5.0  # w: an arm a fifth too fast is driven no further
+STILL = 0.005  # an arm none of whose points is faster is not slowed down [m/s]
+LEAST_KINETIC = 1e-9  # twice the kinetic energy; none is divided by less [J]
+LEAST_INVERSE_MASS = 1e-3  # of a point that some directions cannot move [1/kg]
+
+# Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].
+BESIDE_BASE = 0.3
+
+
+@partial(inner, inlined=True)
+def is_beside_base(views: Views, arm: Arm) -> bool:
+    """Whether an arm's hand is near the axis of its own base."""
+    hand = views.site_xpos[arm.site]
+    base = views.xpos[arm.root]
+    x = hand[0] - base[0]
+    y = hand[1] - base[1]
+    return np.hypot(x, y) < BESIDE_BASE
+
+
+@inner
+def twist_speed(twist: Floats) -> float:
+    """Return how fast the furthest point of a hand can go [m/s]."""
+    return length(twist[:3]) + REACHES * length(twist[3:])
+
+
+@inner
+def point_speed(motion: Floats, place: Floats, origin: Floats) -> float:
+    """Return how fast the furthest point about a place (3,) may go [m/s]; see ``velocity_at``."""
+    x, y, z = velocity_at(motion, place, origin)
+    speed = np.sqrt(x * x + y * y + z * z)
+    return speed + REACHES * length(motion[:3])
+
+
+@partial(inner, inlined=True)
+def place_of(views: Views, arm: Arm, n: int) -> Floats:
+    """Return (3,) the origin of an arm's link; between the fingers for the first, its hand."""
+    if n == 0:
+        return views.site_xpos[arm.site]
+    return views.xpos[arm.links[n]]
+
+
+@partial(inner, inlined=True)
+def fastest_point(views: Views, arm: Arm) -> float:
+    """Return the greatest speed of any point within ``REACHES`` of the hand or of a link's origin [m/s]."""
+    origin = views.subtree_com[arm.root]  # at which MuJoCo's velocities of bodies are
+    fastest = 0.0
+    n = 0
+    while arm.links[n] >= 0:
+        place = place_of(views, arm, n)
+        speed = point_speed(views.cvel[arm.links[n]], place, origin)
+        fastest = max(fastest, speed)
+        n += 1
+    return fastest
+
+
+@partial(inner, inlined=True)
+def hardest_link(views: Views, arm: Arm, work: Work) -> float:
+    """Return p, the largest momentum of a link [N s].
+
+    ``work.factor`` is the Cholesky factor of the arm's mass matrix.
+    """
+    hardest = 0.0
+    n = 0
+    while arm.links[n] >= 0:
+        momentum = link_momentum(views, arm, n, work)
+        hardest = max(hardest, momentum)
+        n += 1
+    return hardest
+
+
+@partial(inner, inlined=True)
+def link_momentum(views: Views, arm: Arm, n: int, work: Work) -> float:
+    """Return |Λ v|, what stops the origin of a link [N s]."""
+    origin = views.subtree_com[arm.root]
+    place = place_of(views, arm, n)
+    velocity = work.momentum
+    x, y, z = velocity_at(views.cvel[arm.links[n]], place, origin)
+    velocity[0] = x
+    velocity[1] = y
+    velocity[2] = z
+
+    rows = work.weighted  # J L⁻ᵀ
+    for i in range(arm.joint_count):
+        for axis in range(3):
+            rows[axis, i] = 0.0
+        if i < arm.link_joints[n]:
+            x, y, z = velocity_at(views.cdof[arm.dofs[i]], place, origin)
+            rows[0, i] = x
+            rows[1, i] = y
+            rows[2, i] = z
+    for axis in range(3):
+        forward(work.factor, arm.joint_count, rows[axis])
+    inner_products(rows, 3, arm.joint_count, work.products)
+    return stopping_impulse(work.products, work.inverse_mass, velocity)
+
+
+@inner
+def stopping_impulse(inverse_mass: Floats, factor: Floats, velocity: Floats) -> float:
+    """Return |Λ v| [N s], and write Λ v into ``velocity`` (3,).
+
+    Args:
+        inverse_mass: (3, 3) or more Λ⁻¹ = J M⁻¹ Jᵀ, up to the diagonal; written to [1/kg].
+        factor: scratch of that shape.
+        velocity: (3,) v [m/s].
+    """
+    for axis in range(3):
+        inverse_mass[axis, axis] += LEAST_INVERSE_MASS
+    solve(inverse_mass, 3, factor, velocity)
+    return length(velocity)
+
+
+@partial(inner, inlined=True)
+def share_at(
+    views: Views, arm: Arm, a: int, limit: SpeedLimit, twist: Floats, momentum: float
+) -> float:
+    """Return the share that arm ``a`` may have of a motion of its hand, a twist (6,), where the hand is now."""
+    share = usual_share(limit, twist_speed(twist), momentum)
+    upright = -views.site_xmat[arm.site, 8]  # 1 for a hand that points down
+    if limit.grid.size > 0 and upright >= limit.least_upright:
+        place = views.site_xpos[arm.site]
+        share = max(share, healthy_share(limit, a, place, twist))
+    return share
+
+
+@partial(inner, inlined=True)
+def present_share(views: Views, arm: Arm, a: int, limit: SpeedLimit, work: Work) -> float:
+    """Return the share that arm ``a`` may have of its present motion."""
+    twist = work.twist
+    for axis in range(6):
+        twist[axis] = 0.0
+        for i in range(arm.joint_count):
+            twist[axis] += work.jacobian[axis, i] * work.velocities[i]
+    momentum = 0.0
+    if limit.momentum < np.inf:
+        cholesky(work.mass, arm.joint_count, work.factor)
+        momentum = hardest_link(views, arm, work)
+    return share_at(views, arm, a, limit, twist, momentum)
+
+
+@partial(inner, inlined=True)
+def slow_down(
+    views: Views, arm: Arm, goal: Goal, a: int, limits: SubstepLimits, work: Work
+) -> bool:
+    """Brake arm ``a`` along its own motion while it passes its limits.
+
+    Mass, bias, Jacobian and velocities of ``work`` are those of the arm.
+
+    Returns:
+        Whether the arm is braked.
+    """
+    speed_limit = limits.speed_limits[a]
+    if speed_limit == np.inf:
+        return False
+    speed = fastest_point(views, arm)
+    if not speed > STILL:
+        return False
+    limit = limits.motion[0]
+    if is_beside_base(views, arm):
+        limit = limits.motion[1]
+    share = present_share(views, arm, a, limit, work)
+    share = min(share, speed_limit / speed)
+    if not share < 1.0:
+        return False
+    brake_motion(views, arm, goal, 1.0 - share, work)
+    return True
+
+
+@partial(inner, inlined=True)
+def brake_motion(views: Views, arm: Arm, goal: Goal, excess: float, work: Work) -> None:
+    """Command the motors of an arm less torque along its motion, a share ``excess`` of which is too much."""
+    n = arm.joint_count
+    multiply(work.mass, n, work.velocities, work.torques)
+    power = 0.0  # that drives the motion on
+    kinetic = 0.0
+    for i in range(n):
+        velocity = work.velocities[i]
+        driving = views.ctrl[arm.motors[i]] - work.bias[i]
+        power += velocity * driving
+        kinetic += velocity * work.torques[i]
+    drive = max(power, 0.0) / max(kinetic, LEAST_KINETIC)
+    rate = SLOWING * excess + min(1.0, ALL_DRIVE * excess) * drive
+    for i in range(n):
+        motor = arm.motors[i]
+        torque = views.ctrl[motor] - rate * work.torques[i]
+        command(views, motor, torque / goal.strengths[i])

@@ -1,0 +1,82 @@
+"""The search for the hardest contact: what it tries, and what it says of it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from asm_gym.policies.hostile_program import (
+    LATEST,
+    MOST_MOTIONS,
+    Program,
+    Segment,
+    changed_program,
+    random_program,
+)
+from asm_gym.scripts.reproduce import harm_search, kit
+from asm_gym.scripts.reproduce.harm_search import Search, searched, tried
+
+DOWN = Segment(steps=30, motion=(0.0, 0.0, -1.0, 0.0, 0.0, 0.0), grip=0.0)
+REST = Segment(steps=10, motion=(0.0,) * 6, grip=0.0)
+
+
+def test_programs_stay_within_their_bounds_however_often_they_are_changed():
+    rng = np.random.default_rng(0)
+    program = random_program(rng)
+    for _ in range(500):
+        program = changed_program(program, rng)
+        assert 1 <= len(program.segments) <= MOST_MOTIONS
+        assert 0 <= program.expert_steps <= LATEST
+        assert all(np.abs(segment.motion).max() <= 1.0 for segment in program.segments)
+
+
+def test_a_program_repeats_its_motions_or_goes_on_with_the_last():
+    program = Program(0, expert_steps=0, waits=True, repeats=False, segments=(DOWN, REST))
+    assert program.at(29) == DOWN
+    assert program.at(500) == REST
+    again = program._replace(repeats=True)
+    assert again.at(39) == REST
+    assert again.at(40) == DOWN
+
+
+def test_a_search_finds_harder_programs_than_chance_and_the_same_ones_again(monkeypatch):
+    def pretended(search, program):
+        """The most force for a program that goes down, of several motions."""
+        down = -min(segment.motion[2] for segment in program.segments)
+        return {"force": 10.0 * len(program.segments) + down, "program": repr(program)}
+
+    monkeypatch.setattr(harm_search, "tried", pretended)
+    found = searched(Search("Lift", "Panda", "default", seed=3, episodes=120))
+    forces = [record["force"] for record in found]
+    assert max(forces[30:]) > max(forces[:30])
+    assert searched(Search("Lift", "Panda", "default", seed=3, episodes=120)) == found
+
+
+def test_the_hardest_contact_of_an_episode_is_told_with_its_bodies():
+    program = Program(5, expert_steps=0, waits=True, repeats=True, segments=(DOWN,))
+    alone = tried(Search("Lift", "Panda", "policy alone", 0, 1), program)
+    assert alone["force"] > 300.0
+    assert "table" in alone["bodies"]
+    assert alone["speed"] > 0.1
+    guarded = tried(Search("Lift", "Panda", "default", 0, 1), program)
+    assert 0.0 < guarded["force"] < 250.0
+    json.dumps(guarded)
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
+    config = kit.Config(workers=1, out=tmp_path)
+    done = []
+
+    def work(item):
+        if item == 3 and done.count(3) == 0:
+            done.append(3)
+            raise KeyboardInterrupt
+        done.append(item)
+        return {"square": item**2, "not a number": np.nan}
+
+    with pytest.raises(KeyboardInterrupt):
+        kit.resumed("items", work, range(5), config)
+    found = kit.resumed("items", work, range(5), config)
+    assert [record["square"] for record in found] == [0, 1, 4, 9, 16]
+    assert done == [0, 1, 2, 3, 3, 4]
+    assert list(tmp_path.iterdir()) == []  # another run begins anew
