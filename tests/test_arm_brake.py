@@ -33,17 +33,17 @@ def hardest(env, limits, action, steps=12):
     ids=["stretching", "rolling", "both"],
 )
 def test_no_link_has_more_momentum_than_it_may(lift, action):
-    braked = hardest(lift, ContactLimits(**FREE, momentum=0.4), action)
-    assert 0.1 < braked < 0.7 < hardest(lift, ContactLimits(**FREE), action)
+    braked = hardest(lift, ContactLimits(**FREE, momentum=1.0), action)
+    assert 0.5 < braked < 2.0 < hardest(lift, ContactLimits(**FREE), action) / 1.5
 
 
 def test_what_a_fault_adds_behind_the_guard_is_braked_too(lift):
-    biased = FaultInjection(lift, [ActionBias(axis=0, amount=2.0)])
+    biased = FaultInjection(lift, [ActionBias(axis=0, amount=2.0, onset=2)])
     rest = np.zeros(7)
     unlimited = hardest(biased, ContactLimits(**FREE), rest)
-    braked = hardest(biased, ContactLimits(**FREE, momentum=0.4), rest)
+    braked = hardest(biased, ContactLimits(**FREE, momentum=1.0), rest)
     biased.undo_faults()
-    assert braked < 0.8 < unlimited / 2
+    assert 0.5 < braked < 2.0 < unlimited / 1.5
 
 
 def fall(strength):
@@ -62,7 +62,7 @@ def fall(strength):
 
 
 def test_a_weak_motor_is_commanded_more_while_the_arm_is_held():
-    assert fall(0.5) < fall(1.0) + 0.01
+    assert fall(0.5) < fall(1.0) + 0.001
 
 
 def test_a_tilted_hand_has_no_pace_in_tasks_whose_healthy_hands_point_down():

@@ -10,8 +10,8 @@ from asm_gym import Episode, collect
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
 from asm_gym.detection.hand_speed_map import MOMENTUM, HandSpeedMap
+from asm_gym.envs.arm_brake import BESIDE_BASE
 from asm_gym.envs.robots import ROBOTS, robot_named
-from asm_gym.envs.speed_limit import BESIDE_BASE
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -121,7 +121,9 @@ def test_limits_of_another_arm_are_refused_at_construction(lift):
         NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits="none")
 
 
-def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
+def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_quarter_as_fast_for_a_second(
+    lift,
+):
     spec, yes, no = lift.unwrapped.stream_spec, np.ones(1, bool), np.zeros(1, bool)
     limits = EpisodeLimits(robots_of(lift, spec, spec.dt)[0], ContactLimits(), True)
     limits.begin(yes)
@@ -132,7 +134,7 @@ def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_
         limits.follow(yes, no)
     assert (
         told[:20]
-        == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
+        == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 4)] * 20
     )
     assert told[20] == ContactLimits()
 
@@ -217,7 +219,7 @@ def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_heal
     elsewhere = HandSpeedMap(np.array([[0, 20, 20, 20, *[0.1] * 12]]))
     forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
     assert most(forward, elsewhere)[0] < 1.2 * MOMENTUM < most(forward, None)[0] / 1.5
-    assert most(sideways, elsewhere)[1] > 2.0 * most(forward, elsewhere)[1]
+    assert most(sideways, elsewhere)[1] > 1.1 * most(forward, elsewhere)[1]
 
 
 def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():

@@ -91,7 +91,8 @@ def test_success_is_paired_by_scene_and_counted_without_a_blow():
 def test_every_kind_of_policy_that_is_asked_for_has_its_cases():
     found = harm.cases(harm.Config(episodes=2, against=harm.AGAINST, healthy=3, tasks=("Lift",)))
     kinds = Counter(case.kind for case, _ in found)
-    assert kinds["hostile"] == len(HOSTILE) * (1 + len(harm.ELSEWHERE)) + 2
+    impaired = len(harm.RAMMING) * len(harm.IMPAIRMENTS)
+    assert kinds["hostile"] == len(HOSTILE) * (1 + len(harm.ELSEWHERE)) + 2 + impaired
     assert (kinds["healthy"], kinds["faulty"]) == (2, 10)
     assert {case.config.robot for case, n in found if n == 2} == {"Panda", "Sawyer", "IIWA"}
 

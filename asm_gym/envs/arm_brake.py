@@ -8,8 +8,9 @@ Of its present motion q̇ an arm may have the share s, the least of
 where p is the largest impulse |Λ v| that stops a link, Λ⁻¹ = J M⁻¹ Jᵀ: what a link pushes with that meets something
 hard and does not slide, be it a forearm on the robot's own pedestal. Beyond that the motors slow the arm down,
 
-    τ ← τ - M (K (1 - s) + w α) q̇         α: q̇ᵀ(τ - h) / q̇ᵀ M q̇ where it is positive, what drives the motion on
+    τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
+so that nothing drives it on, and for a moment nothing pushes with full force on what has stopped it.
 A motor that delivers less torque than it was commanded is commanded so much more while it brakes.
 """
 
@@ -35,9 +36,10 @@ from asm_gym.envs.mujoco_views import Arm, Floats, Goal, SubstepLimits, Views, W
 
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
-ALL_DRIVE = 5.0  # w: an arm a fifth too fast is driven no further
-STILL = 0.005  # an arm none of whose points is faster is not slowed down [m/s]
-LEAST_KINETIC = 1e-9  # twice the kinetic energy; none is divided by less [J]
+ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
+DRIVE_LOST_KEPT = 0.97  # share of w from substep to substep: half of it in 45 ms
+LEAST_DRIVE_LOST = 0.02  # w from which on an arm counts as braked
+LEAST_SPEED = 1e-9  # no speed is divided by less [m/s]
 LEAST_INVERSE_MASS = 1e-3  # of a point that some directions cannot move [1/kg]
 
 # Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].
@@ -188,35 +190,32 @@ def slow_down(
     speed_limit = limits.speed_limits[a]
     if speed_limit == np.inf:
         return False
-    speed = fastest_point(views, arm)
-    if not speed > STILL:
-        return False
+    speed = max(fastest_point(views, arm), LEAST_SPEED)
     limit = limits.motion[0]
     if is_beside_base(views, arm):
         limit = limits.motion[1]
     share = present_share(views, arm, a, limit, work)
     share = min(share, speed_limit / speed)
-    if not share < 1.0:
+    excess = max(0.0, 1.0 - share)
+    goal.drive_lost = max(min(1.0, ALL_DRIVE * excess), DRIVE_LOST_KEPT * goal.drive_lost)
+    if excess == 0.0 and goal.drive_lost < LEAST_DRIVE_LOST:
         return False
-    brake_motion(views, arm, goal, 1.0 - share, work)
+    brake_motion(views, arm, goal, excess, work)
     return True
 
 
 @partial(inner, inlined=True)
 def brake_motion(views: Views, arm: Arm, goal: Goal, excess: float, work: Work) -> None:
-    """Command the motors of an arm less torque along its motion, a share ``excess`` of which is too much."""
+    """Command the motors of an arm less of what drives it, and less along its motion.
+
+    Args:
+        excess: share of the motion that is too much.
+    """
     n = arm.joint_count
     multiply(work.mass, n, work.velocities, work.torques)
-    power = 0.0  # that drives the motion on
-    kinetic = 0.0
-    for i in range(n):
-        velocity = work.velocities[i]
-        driving = views.ctrl[arm.motors[i]] - work.bias[i]
-        power += velocity * driving
-        kinetic += velocity * work.torques[i]
-    drive = max(power, 0.0) / max(kinetic, LEAST_KINETIC)
-    rate = SLOWING * excess + min(1.0, ALL_DRIVE * excess) * drive
     for i in range(n):
         motor = arm.motors[i]
-        torque = views.ctrl[motor] - rate * work.torques[i]
+        drive = views.ctrl[motor] - work.bias[i]
+        torque = views.ctrl[motor] - goal.drive_lost * drive
+        torque -= SLOWING * excess * work.torques[i]
         command(views, motor, torque / goal.strengths[i])

@@ -114,6 +114,7 @@ GOAL = np.dtype(
         ("joints", np.float64, JOINTS),  # [rad]
         ("anchor", np.float64, JOINTS),  # where an arm that is held is to stay [rad]
         ("strengths", np.float64, JOINTS),  # share of its commanded torque that a motor delivered
+        ("drive_lost", np.float64),  # w of ``arm_brake``
         ("held", np.int64),  # 0, or HELD, BRAKING, YIELDING of ``controllers``
     ]
 )

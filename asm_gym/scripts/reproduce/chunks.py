@@ -20,6 +20,7 @@ from asm_gym.policies import rollout
 from asm_gym.rollouts.run_trials import collect, environment, staged
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import harm, kit
+from asm_gym.scripts.reproduce.harm_cases import Case
 from asm_gym.tasks import env_id
 
 CHUNK = 16  # actions that are announced
@@ -37,7 +38,7 @@ class Config(harm.Config):
     """Which policies; the guards of asm-gym reproduce harm are not used."""
 
 
-def episode(job: tuple[harm.Case, Any]) -> kit.Record:
+def episode(job: tuple[Case, Any]) -> kit.Record:
     """Run a policy alone; return when it first hits something, and which of its chunks were refused before."""
     case, places = job
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
