@@ -9,7 +9,7 @@ import pytest
 from asm_gym import Episode, collect
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
-from asm_gym.detection.hand_speed_map import MOMENTUM, HandSpeedMap
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.envs.arm_brake import BESIDE_BASE
 from asm_gym.envs.robots import ROBOTS, robot_named
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
@@ -216,9 +216,10 @@ def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_heal
             found.append((hand_momentum(simulation, 0, twist), np.linalg.norm(twist[:3])))
         return np.max(found, axis=0)
 
-    elsewhere = HandSpeedMap(np.array([[0, 20, 20, 20, *[0.1] * 12]]))
+    momentum = 2.0
+    elsewhere = HandSpeedMap(np.array([[0, 20, 20, 20, *[0.1] * 12]]), momentum)
     forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
-    assert most(forward, elsewhere)[0] < 1.2 * MOMENTUM < most(forward, None)[0] / 1.5
+    assert most(forward, elsewhere)[0] < 1.2 * momentum < most(forward, None)[0] / 1.5
     assert most(sideways, elsewhere)[1] > 1.1 * most(forward, elsewhere)[1]
 
 
