@@ -114,7 +114,9 @@ class SurprisedModel(ABC):
     def __init__(self, reader: StreamScaler) -> None:
         self.reader = reader
         spec = reader.spec
-        self.columns = np.concatenate([spec.sensory, reader.slow, spec.commanded])  # (N,) of each error
+        self.columns = np.concatenate(
+            [spec.sensory, reader.slow, spec.commanded]
+        )  # (N,) of each error
         self.ceiling = 1.0
         self.rows: list[Floats] = []
 

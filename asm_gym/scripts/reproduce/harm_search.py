@@ -54,7 +54,7 @@ class HardestContact:
     """Notes the hardest contact of an arm in an episode; called after each physics substep.
 
     Args:
-        simulation: of the loaded model.
+        arm: the environment, whose model some resets replace.
 
     Attributes:
         force: the largest net contact force on an arm [N].
@@ -62,20 +62,17 @@ class HardestContact:
         speed: at which an arm's body met another shortly before [m/s].
     """
 
-    def __init__(self, simulation: Any) -> None:
-        self._simulation = simulation
-        model = simulation.model
-        roots = model.body_rootid[simulation.arms.root]
-        is_robot = np.isin(model.body_rootid, roots)
-        self._is_arm = is_robot & (model.body_weldid != 0)
+    def __init__(self, arm: Any) -> None:
+        self._arm = arm
         self._speeds: deque[float] = deque(maxlen=APPROACH_SUBSTEPS)
         self.force = 0.0
         self.bodies = ("", "")
         self.speed = 0.0
 
     def __call__(self, substep: int) -> None:
-        touching = self._touching()
-        data = self._simulation.data
+        simulation = self._arm.simulation
+        data = simulation.data
+        touching = _touching(simulation)
         rows = data.contact.efc_address[touching]
         rows = rows[rows >= 0]
         approach = 0.0
@@ -83,30 +80,34 @@ class HardestContact:
             approach = float(max(0.0, -data.efc_vel[rows].min()))
         self._speeds.append(approach)
 
-        force = float(self._simulation.contact_forces[-1])
+        force = float(simulation.contact_forces[-1])
         if force > self.force and len(touching):
             self.force = force
             self.speed = max(self._speeds)
-            self.bodies = self._pressing(touching)
+            self.bodies = _pressing(simulation, touching)
 
-    def _touching(self) -> NDArray[np.intp]:
-        """Return the contacts of the arms with anything."""
-        contact = self._simulation.data.contact
-        bodies = self._simulation.model.geom_bodyid[contact.geom]
-        return np.flatnonzero(self._is_arm[bodies].any(axis=1))
 
-    def _pressing(self, touching: NDArray[np.intp]) -> tuple[str, str]:
-        """Return the bodies of the contact with the largest force."""
-        model = self._simulation.model
-        data = self._simulation.data
-        wrench = np.zeros(6)
-        forces = []
-        for number in touching.tolist():
-            mujoco.mj_contactForce(model, data, number, wrench)
-            forces.append(np.linalg.norm(wrench[:3]))
-        hardest = touching[int(np.argmax(forces))]
-        one, other = model.geom_bodyid[data.contact.geom[hardest]]
-        return model.body(one).name, model.body(other).name
+def _touching(simulation: Any) -> NDArray[np.intp]:
+    """Return the contacts of the arms with anything."""
+    model = simulation.model
+    roots = model.body_rootid[simulation.arms.root]
+    is_arm = np.isin(model.body_rootid, roots) & (model.body_weldid != 0)
+    bodies = model.geom_bodyid[simulation.data.contact.geom]
+    return np.flatnonzero(is_arm[bodies].any(axis=1))
+
+
+def _pressing(simulation: Any, touching: NDArray[np.intp]) -> tuple[str, str]:
+    """Return the bodies of the contact with the largest force."""
+    model = simulation.model
+    data = simulation.data
+    wrench = np.zeros(6)
+    forces = []
+    for number in touching.tolist():
+        mujoco.mj_contactForce(model, data, number, wrench)
+        forces.append(np.linalg.norm(wrench[:3]))
+    hardest = touching[int(np.argmax(forces))]
+    one, other = model.geom_bodyid[data.contact.geom[hardest]]
+    return model.body(one).name, model.body(other).name
 
 
 def tried(search: Search, program: Program) -> Record:
@@ -115,7 +116,7 @@ def tried(search: Search, program: Program) -> Record:
     case = Case("hostile", "program", trial, RolloutConfig(robot=search.robot))
     arm: Any = environment(trial.env_id, case.config.settings).unwrapped
     with staged(trial, case.config) as env:
-        contact = HardestContact(arm.simulation)
+        contact = HardestContact(arm)
         arm.substep_hooks.append(contact)
         try:
             guarded_env = guarded(env, search.guard, case)
