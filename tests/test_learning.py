@@ -155,6 +155,7 @@ def test_a_record_adds_up_each_episode():
     assert frame.blows.tolist() == [1, 1, 1]  # steps that follow each other are one contact
     assert frame.peak.tolist() == [300, 290, 600]
     assert frame.success.tolist() == [0, 0, 1]
+    assert frame.slowed.isna().all()  # no guard tells
     assert frame.joint_stops.tolist() == [0, 4, 0]
     assert frame.self_contacts.tolist() == [4, 0, 4]
     harm = [2 * 260, 250 + 241, 560]

@@ -23,7 +23,8 @@ class LearningRecord(VectorWrapper):
     ``episodes`` are dicts of: ``step``, the steps of all members when it ended; ``member``; ``length`` in steps;
     ``reward``; ``success``; ``harm``, contact force beyond 40 N summed over physics substeps [N s]; ``peak``, the
     largest contact force in any substep [N]; ``blows``, contacts beyond 280 N; steps ``overridden``, ``slowed`` by the
-    speed limit, and in alarm (``cost``); ``joint_stops`` and ``self_contacts``, summed over steps.
+    speed limit (NaN without a guard), and in alarm (``cost``); ``joint_stops`` and ``self_contacts``, summed over
+    steps.
 
     Args:
         env: a vector of this package's environments, guarded or not, without autoreset.
@@ -62,10 +63,10 @@ class LearningRecord(VectorWrapper):
         force = np.nan_to_num(np.asarray(infos["contact_force"], np.float64))
         is_hard = force > TRANSIENT
         overridden = np.asarray(infos.get("overridden", nothing), bool)
-        executed = proposed
+        slowed = np.full(self.num_envs, np.nan)  # only a guard tells
         if "asm" in infos:
-            executed = infos["asm"]["executed_action"]
-        is_changed = np.any(np.abs(executed - proposed) > SMALLEST, axis=1)
+            change = np.abs(infos["asm"]["executed_action"] - proposed)
+            slowed = np.any(change > SMALLEST, axis=1) & ~overridden
         self.steps += self.num_envs
         self._lengths += 1
         self._sums += np.column_stack(
@@ -74,7 +75,7 @@ class LearningRecord(VectorWrapper):
                 np.nan_to_num(np.asarray(infos["contact_impulse"], np.float64)),
                 is_hard & ~self._was_hard,
                 overridden,
-                is_changed & ~overridden,
+                slowed,
                 np.asarray(infos.get("cost", nothing)),
                 infos["joint_stops"],
                 infos["self_contacts"],

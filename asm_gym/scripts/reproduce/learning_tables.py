@@ -40,7 +40,7 @@ def findings(results: Sequence[Record], paces: Sequence[Record]) -> kit.Findings
 def summary(result: Record) -> Record:
     """Return one row of numbers of a run, which its file holds."""
     episodes = pd.DataFrame(result["learning"])
-    total = episodes.sum()
+    total = episodes.sum(skipna=False)
     per_step = total / total.length
     hours = total.length * result["period"] / 3600.0
     first = episodes[episodes.step <= FIFTH * result["steps"]]
