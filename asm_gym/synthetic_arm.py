@@ -122,6 +122,11 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         stream = np.concatenate([observation, np.zeros(JOINTS, np.float32)])
         return observation, {"stream": stream}
 
+    def begin_at(self, position: Floats) -> None:
+        """Place the arm at rest, at positions (7,) [rad]."""
+        self._q = np.array(position, np.float64)
+        self._v = np.zeros(JOINTS)
+
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move one step by the commanded velocities [rad/s]."""
         command = np.clip(np.asarray(action, np.float64), -FASTEST_COMMAND, FASTEST_COMMAND)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import blamed
+from asm_gym.data.alarm_reasons import SURPRISING, blamed
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.episode import Episode
@@ -23,18 +23,20 @@ from asm_gym.detection.incidents import Incident, IncidentBook, power_of, rows_o
 from asm_gym.evaluation.incident_window import AFTER_S, BEFORE_S, IncidentWindow
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
-from asm_gym.monitors.blame import reattribute_alarms
+from asm_gym.monitors import named_causes
+from asm_gym.monitors.blame import blamed_columns, reattribute_alarms
 from asm_gym.monitors.expectation import (
     Expectation,
     Expected,
     shift_of_columns,
     shifts_kept_in,
 )
+from asm_gym.monitors.named_causes import CauseNamer, NamedCause
 from asm_gym.readings import spans
 
 HEADINGS = (
     *("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date"),
-    *("sensed", "expected", "±", "unit", "rows around it"),
+    *("sensed", "expected", "±", "unit", "rows around it", "cause", "what to do"),
 )
 Floats = NDArray[np.float64]
 MOST_NAMED = 3  # channels that the table of an hour names
@@ -57,6 +59,8 @@ class Alarm(NamedTuple):
     group: str = ""  # of the channel
     beside: Expected | None = None  # the channel in its first row beside what was expected
     evidence: str = ""  # file of the rows around it
+    cause: str = ""  # in words; empty where none was looked for
+    remedy: str = ""  # what to do about it
 
     @property
     def stamp(self) -> float | None:
@@ -81,7 +85,7 @@ class Alarm(NamedTuple):
             beside = (f"{sensed:.5g}", f"{expected:.5g}", f"{plus_minus:.2g}", unit)
         return (
             *(self.log, *times, self.channel, self.why, f"{self.excess:.2f}", self.date),
-            *(*beside, self.evidence),
+            *(*beside, self.evidence, self.cause, self.remedy),
         )
 
 
@@ -118,8 +122,22 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
         if expectation is not None:
             rows = trace.stream[max(alarm.row - 1, 0) : alarm.row + 1]
             alarm = alarm._replace(beside=expectation.at_end(rows, incident.column))
+        if incident.reason == SURPRISING and trace.namer is not None:
+            cause = cause_of(trace, alarm.row, trace.namer)
+            in_words = cause.in_words(trace.channels, trace.units)
+            alarm = alarm._replace(cause=in_words, remedy=cause.remedy)
         alarms.append(alarm)
     return alarms
+
+
+def cause_of(trace: ScoredEpisode, first: int, namer: CauseNamer) -> NamedCause:
+    """Return the cause of the alarm that was raised in a row."""
+    assert trace.attribution is not None
+    assert trace.stream is not None
+    start = max(0, first - round(named_causes.BEFORE_S / trace.dt))
+    stop = first + round(named_causes.AFTER_S / trace.dt) + 1
+    columns = blamed_columns(trace.attribution[first])
+    return namer(trace.stream[start:stop], first - start, columns)
 
 
 def _alarm(trace: ScoredEpisode, incident: Incident) -> Alarm:
@@ -198,6 +216,7 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
     shift = shift_of_columns(monitor.spec, shifts_kept_in(about))
     surprises = monitor.score_episodes([recentred(log.episode, shift) for log in logs])
     blame = getattr(monitor, "blame_", None)
+    namer = getattr(monitor, "cause_namer_", None)
     traces = []
     for (name, episode), surprise in zip(logs, surprises, strict=True):
         fault = episode.faults
@@ -218,6 +237,8 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
             fault=fault,
             stream=episode.stream,
             origin=episode.info.get(LOG_ORIGIN),
+            namer=namer,
+            units=monitor.spec.units,
         )
         before_blame = {row: judged.attribution[row].copy() for row in trace.alarms}
         reattribute_alarms(blame, episode.stream, trace.alarms, judged.attribution)

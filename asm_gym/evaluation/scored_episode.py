@@ -16,6 +16,7 @@ from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.detection.contact_limits import LEANS_S
 from asm_gym.detection.incidents import incidents_in
 from asm_gym.evaluation.defaults import TRANSIENT
+from asm_gym.monitors.named_causes import CauseNamer
 from asm_gym.readings import spans
 
 Floats = NDArray[np.floating[Any]]
@@ -76,6 +77,8 @@ class ScoredEpisode:
     power: float = 1.0  # by which the detection pools the channels, for incidents
     # by row, the shares (D,) of the channels in its surprise, before blame; of rows near the threshold or above
     strong_shares: Mapping[int, Floats] = field(default_factory=dict)
+    units: tuple[str, ...] = ()  # of the channels
+    namer: CauseNamer | None = None  # of the causes of alarms
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):

@@ -37,6 +37,8 @@ class LiveEvent:
     stamp: float | None = None  # of the row, by the robot's own clock [s]
     # Wall clock, ISO 8601: when it happened, or by a clock of dates; empty if unknown.
     date: str = ""
+    cause: str = ""  # in words, once it is known
+    remedy: str = ""  # what to do about it
     log: str = ""  # the recording; empty of a live source
     incident: int | None = None  # its number, from 1
     group: str = ""  # of the channel

@@ -31,6 +31,7 @@ from asm_gym.detection.incidents import AlarmRow, Incident, IncidentBook, power_
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.guard import Guard
 from asm_gym.guard.incident_desk import IncidentDesk
+from asm_gym.guard.live_causes import LiveCauses
 from asm_gym.guard.live_events import (
     ALARM,
     CLOCK,
@@ -160,6 +161,8 @@ class LiveWatch(Adapter):
         self._book = IncidentBook(power_of(monitor))  # of all else, by the time of the rows
         self._desk = IncidentDesk(monitor, self._guard, settings, names, self._note)
         self._blame = FollowedBlame(monitor)
+        self._causes = LiveCauses(monitor)
+        self._names = names
         self._judge(np.zeros(spec.size), is_bridged=False)  # compiles
         self._begin()
 
@@ -167,6 +170,7 @@ class LiveWatch(Adapter):
         """Forget the rows before: they are not the past of those that follow."""
         self._guard.begin()
         self._blame.begin()
+        self._causes.begin()
         self._bridge = Bridge(self._settings.bridge_s, self._spec.dt, self._spec.size)
         self._was_over = False  # the surprise of the newest row was over its threshold
         self._last_event = NO_EVENT  # of the newest row
@@ -287,6 +291,10 @@ class LiveWatch(Adapter):
     def report_step(self, reports: Sequence[RowReport], target: Row) -> None:
         """Say alarms and events of the row that the reports are of."""
         for report in reports:
+            cause = self._causes.follow(target.numbers)
+            if cause is not None:
+                text = f"cause: {cause.in_words(self._names, self._spec.units)}; {cause.remedy}"
+                self._note(text, cause=cause.name, remedy=cause.remedy)
             self._report_surprise(report, target.numbers)
             self._report_event(EVENTS[report.robots["event"][0]])
 
@@ -310,6 +318,8 @@ class LiveWatch(Adapter):
         incident = self._book.follow(row)
         if incident is not None:
             self._alarm_surprise(incident, numbers)
+            if incident.reason == SURPRISING:
+                self._causes.open(shares)
 
     def _alarm_surprise(self, incident: Incident, numbers: NDArray[np.float64]) -> None:
         """Raise the alarm of an incident that a row opens."""

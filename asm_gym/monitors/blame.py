@@ -36,6 +36,7 @@ EXPLAINED = 0.1  # share of the excess of energy over earlier rows that a row ma
 LEAST_EXCESS = 20.0  # of energy, under which nothing is to be explained
 MOST_BLAMED = 3  # channels
 REMEMBERED = 64  # rows that may tell a repeating reading from others
+FURTHER_EXCESS = 150.0  # under which nothing is explained beside what is certain
 LEAST_SHARE = 0.2  # in the largest one, of a channel that is suspected then
 COST = 2.0  # of each number that an explanation may choose, in energy: Akaike's criterion
 CANDIDATES = 24  # channels that are tried otherwise, those with the most energy of their own
@@ -91,6 +92,40 @@ class Blame:
         with ONE_THREAD:
             return tuple(certain + self._explaining(recent, certain, shares))[:MOST_BLAMED]
 
+    def deviations(self, rows: Rows, columns: Sequence[int], most: int) -> Floats:
+        """Return how far columns are from what explains rows (1 + T, D) best, in their units.
+
+        Args:
+            rows: of one stretch.
+            columns: (n,) that are at fault together.
+            most: rows that are looked at, evenly spaced.
+
+        Returns:
+            (at most ``most``, n).
+        """
+        completion = self.completion
+        lifted = self._lifted(rows.astype(np.float64))
+        firsts = np.cumsum([0, *(self._freedom[column] for column in columns[:-1])])
+        found = []
+        with ONE_THREAD:
+            for row in range(0, len(lifted.y), max(1, len(lifted.y) // most)):
+                directions = self._directions(lifted.standard[row], (), columns)
+                A, stiffness = directions.changes, self._stiffness(directions)
+                h = A.T @ (completion.precision[directions.entries] @ lifted.y[row])
+                found.append(np.linalg.solve(stiffness, h)[firsts])
+        spread = completion.senses.spread[list(columns)]
+        return np.array(found[:most]) * spread
+
+    def repeating(self, rows: Rows) -> list[int]:
+        """Return the columns that repeat their reading up to the end of rows (T, D) for longer than any learned."""
+        return self._repeating(rows, np.zeros(rows.shape[1]))
+
+    def _stiffness(self, directions: _Directions) -> Floats:
+        """Return Aᵀ P A (k, k)."""
+        entries = directions.entries
+        block = self.completion.precision[np.ix_(entries, entries)]
+        return directions.changes.T @ block @ directions.changes
+
     def _outside(self, row: Floats) -> list[int]:
         """Return the columns whose value is outside of its range, the farthest first."""
         least, most, _ = self.completion.usual
@@ -128,6 +163,8 @@ class Blame:
         found: list[int] = []
         left = excess(found)
         enough = max(EXPLAINED * left, LEAST_EXCESS)
+        if certain:
+            enough = max(enough, FURTHER_EXCESS)
         if left <= enough and not certain:
             suspects = np.flatnonzero(shares >= LEAST_SHARE * shares.max()).tolist()
             return [min(suspects, key=lambda column: cost([column]))]
@@ -168,8 +205,7 @@ class Blame:
                 continue
             A = directions.changes
             h = A.T @ force[directions.entries]
-            stiffness = A.T @ P[np.ix_(directions.entries, directions.entries)] @ A
-            total -= float(h @ np.linalg.solve(stiffness, h))
+            total -= float(h @ np.linalg.solve(self._stiffness(directions), h))
         return total
 
     def _directions(
@@ -272,3 +308,14 @@ def reattribute_alarms(
     for row in alarms:
         rows = stream[max(0, row + 1 - REMEMBERED) : row + 1]
         shares[row] = reattributed(shares[row], blame(rows, shares[row]))
+
+
+def blamed_columns(shares: Row) -> tuple[int, ...]:
+    """Return the columns that shares (D,) of ``reattributed`` blame, the first alone where they are of all columns."""
+    if not np.isfinite(shares).all():
+        return ()
+    order = np.argsort(-shares, kind="stable")
+    count = int((shares > 0).sum())
+    if count > MOST_BLAMED:
+        count = 1
+    return tuple(order[:count].tolist())

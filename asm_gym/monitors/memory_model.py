@@ -22,6 +22,7 @@ from asm_gym.memory.linear_association import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.monitor_protocol import Progress
+from asm_gym.monitors.pace_memory import PaceMemory
 from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, unwritten
 from asm_gym.monitors.stream_model import ScaledModel, require_arrays
 from asm_gym.scaling import StreamScaler, rows_apart
@@ -40,6 +41,7 @@ class MemoryModel(ScaledModel):
         network_: the weights; None before ``fit``.
         motor_: the motor association; None before ``learn_to_act``.
         completion_: completes missing senses; None where they are too many, and once some were lost.
+        pace_: how fast healthy motion passes its places; None without positions, and in older files.
         compiled_: what the row kernel computes with; None before ``fit``.
     """
 
@@ -63,6 +65,7 @@ class MemoryModel(ScaledModel):
         self.compiled_: RowWeights | None = None
         self.motor_: Motor | None = None
         self.completion_: Completion | None = None
+        self.pace_: PaceMemory | None = None
 
     @property
     def network(self) -> TemporalNetwork:
@@ -106,6 +109,9 @@ class MemoryModel(ScaledModel):
         completion = Completion.fit(senses, [episode.stream for episode in episodes])
         if completion is not None:
             learned |= completion.named()
+        pace = PaceMemory.fit(senses, [episode.stream for episode in episodes])
+        if pace is not None:
+            learned |= pace.named()
         return self.restore(learned)
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
@@ -150,6 +156,7 @@ class MemoryModel(ScaledModel):
         super().restore(learned, skills)
         self.motor_ = Motor.found(learned, self.senses_)
         self.completion_ = Completion.found(learned, self.senses_)
+        self.pace_ = PaceMemory.found(learned, self.senses_)
         self.network_ = network
         self.compiled_ = row_weights(network, self.senses_, learned)
         return self

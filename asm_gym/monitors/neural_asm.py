@@ -35,6 +35,7 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor_files import restored
 from asm_gym.monitors.monitor_protocol import Progress, Surprise
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows
+from asm_gym.monitors.named_causes import CauseNamer
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
@@ -194,6 +195,14 @@ class NeuralASM(CalibratedMonitor):
         if self._blame is None or self._blame.completion is not completion:
             self._blame = Blame(completion)
         return self._blame
+
+    @property
+    def cause_namer_(self) -> CauseNamer | None:
+        """Names causes of alarms in words; None if no sense can be estimated."""
+        blame = self.blame_
+        if blame is None:
+            return None
+        return CauseNamer(blame, self.model.pace_)
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:

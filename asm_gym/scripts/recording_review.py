@@ -110,6 +110,8 @@ def event_of(alarm: Alarm) -> LiveEvent:
         log=alarm.log,
         group=alarm.group,
         evidence=alarm.evidence,
+        cause=alarm.cause,
+        remedy=alarm.remedy,
         **beside_of(alarm),
     )
 
@@ -145,3 +147,6 @@ def say_table(
     for cells in lines_of_cells:
         log, start, end, channel, why, excess, _ = cells[:PRINTED]
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
+    for alarm in printed:
+        if alarm.cause:
+            say(f"{alarm.start:>10.3f}  {alarm.cause}; {alarm.remedy}")

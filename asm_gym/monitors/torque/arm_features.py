@@ -172,6 +172,11 @@ def torque_columns(spec: StreamSpec) -> NDArray[np.intp]:
     return np.setdiff1d(named_columns(spec, TORQUE_NAME), named_columns(spec, COMMANDED_NAME))
 
 
+def position_columns(spec: StreamSpec) -> NDArray[np.intp]:
+    """Return the columns of measured positions, by their names."""
+    return np.setdiff1d(named_columns(spec, POSITION_NAME), named_columns(spec, COMMANDED_NAME))
+
+
 def motion_columns(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of positions and speeds, by their names."""
     return np.union1d(named_columns(spec, POSITION_NAME), named_columns(spec, SPEED_NAME))
