@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from asm_gym.guard.live_causes import LiveCauses
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import named_causes
 from asm_gym.monitors.blame import REMEMBERED, Blame
@@ -120,3 +121,22 @@ def test_every_cause_has_a_remedy_and_says_its_size():
         assert cause.remedy
         assert cause.in_words(labels, SPEC.units).startswith(name)
         assert "0.7" in cause.in_words(labels, SPEC.units)
+
+
+def test_a_live_alarm_has_its_cause_as_soon_as_that_is_clear():
+    blame, pace, width = learned()
+
+    class Monitor:
+        spec = SPEC
+        cause_namer_ = CauseNamer(blame, pace)
+
+    rows = faulty(healthy(), Fault("frozen", 9), width)
+    live = LiveCauses(Monitor())
+    named = {}
+    for number, row in enumerate(rows):
+        cause = live.follow(row)
+        if cause is not None:
+            named[number] = cause.name
+        if number == ONSET + 4:
+            live.open(np.eye(SPEC.size)[9])
+    assert named == {ONSET + 4 + round(0.5 / SPEC.dt): "frozen"}
