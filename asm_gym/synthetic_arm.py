@@ -1,6 +1,6 @@
 """Simulate a synthetic arm at 100 Hz without a simulator: seven coupled joints that follow commanded velocities.
 
-    M v̇ = τ - g(q) - 3 D v - D tanh(20 v)/2      D: the diagonal of M;  g with a load that is drawn for each episode
+    M v̇ = τ - g(q) - f(3 D v + D tanh(20 v)/2)   D: the diagonal of M;  g with a load that is drawn for each episode
     τ   = 60 D (u - v) + ĝ(q)                     the drive: a velocity loop, with gravity compensated for a load of 1
 
 A payload of m kg at the hand adds m g times the horizontal distance from each joint that bears gravity to the hand.
@@ -51,7 +51,7 @@ def _payload_torque(position: Floats) -> Floats:
 
 @compiled
 def _advance(
-    q: Floats, v: Floats, command: Floats, loads: tuple[float, float], inverse: Floats
+    q: Floats, v: Floats, command: Floats, loads: tuple[float, float, float], inverse: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return position, velocity and torque (7,) after a control step.
 
@@ -59,18 +59,18 @@ def _advance(
         q: positions (7,) [rad].
         v: velocities (7,) [rad/s].
         command: commanded velocities (7,) [rad/s].
-        loads: of the links, 1 where the drive compensates for all, and the payload [kg].
+        loads: of the links, 1 where the drive compensates for all; the payload [kg]; friction, 1 that of a new arm.
         inverse: of M.
     """
-    load, payload = loads
+    load, payload, friction = loads
     dt = CONTROL_PERIOD_S / SUBSTEPS
     torque = command
     for _ in range(SUBSTEPS):
         compensated = _gravity(q)
         torque = 60 * MASS * (command - v) + compensated
-        friction = 3 * MASS * v + 0.5 * MASS * np.tanh(20 * v)
+        rubbing = friction * (3 * MASS * v + 0.5 * MASS * np.tanh(20 * v))
         weight = load * compensated + payload * _payload_torque(q)
-        accelerating = torque - weight - friction
+        accelerating = torque - weight - rubbing
         v = v + dt * (inverse @ accelerating)
         q = q + dt * v
     return q, v, torque
@@ -82,6 +82,7 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     Args:
         horizon: steps of an episode.
         payload: at the hand [kg]; may be changed at any time.
+        friction: f, 1 that of a new arm; likewise.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
@@ -98,9 +99,10 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     dt = CONTROL_PERIOD_S
     action_means = "velocity"
 
-    def __init__(self, horizon: int = 400, payload: float = 0.0) -> None:
+    def __init__(self, horizon: int = 400, payload: float = 0.0, friction: float = 1.0) -> None:
         self.horizon = horizon
         self.payload = payload
+        self.friction = friction
         sensed = 3 * JOINTS
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (sensed,), np.float32)
         self.action_space = gym.spaces.Box(-FASTEST_COMMAND, FASTEST_COMMAND, (JOINTS,), np.float32)
@@ -130,7 +132,7 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move one step by the commanded velocities [rad/s]."""
         command = np.clip(np.asarray(action, np.float64), -FASTEST_COMMAND, FASTEST_COMMAND)
-        loads = (self._load, self.payload)
+        loads = (self._load, self.payload, self.friction)
         self._q, self._v, torque = _advance(self._q, self._v, command, loads, self._inverse)
         self._steps += 1
         truncated = self._steps >= self.horizon

@@ -31,6 +31,7 @@ from asm_gym.detection.evidence import (
     whitening,
     worst_case,
 )
+from asm_gym.detection.glitches import SpikeRule, Waiting
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
@@ -45,9 +46,10 @@ from tests.streams import frozen, sine_episodes, sine_spec
 
 def accumulate(evidence, whitened, context, gains):
     """The equation of ``evidence``, the oracle of ``accumulated`` and of the compiled step."""
-    vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
-    return Evidence(
-        vector, evidence.context + CONTEXT_GAIN * (context - evidence.context), evidence.steps + 1
+    return evidence._replace(
+        vector=evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector),
+        context=evidence.context + CONTEXT_GAIN * (context - evidence.context),
+        steps=evidence.steps + 1,
     )
 
 
@@ -80,9 +82,10 @@ def test_the_evidence_of_a_whole_episode_is_that_of_its_rows(steps):
         evidence = accumulate(evidence, e[None], c[None], gains)
         vectors.append(evidence.vector[0])
         running.append(evidence.context[0])
-    for found, wanted in zip(
-        accumulated(whitened, contexts, gains), (vectors, running), strict=True
-    ):
+    together = accumulated(
+        whitened, contexts, gains, SpikeRule.unused(4), Waiting.start(1, errors=4)
+    )
+    for found, wanted in zip(together, (vectors, running), strict=True):
         np.testing.assert_array_equal(found, wanted)
 
 

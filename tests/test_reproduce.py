@@ -73,6 +73,7 @@ def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
         "harm",
         "chunks",
         "learning",
+        "wear",
     ):  # which count episodes or have intervals; the others have means ± deviations and a figure
         assert rows
         assert "|" in table

@@ -28,6 +28,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.memory_skills import name_skills, recall
 from asm_gym.monitors.monitor_state import MonitorState
+from tests.spikes import followed, held_back
 from tests.streams import sine_episodes, sine_spec
 
 
@@ -81,9 +82,12 @@ def observed_by(asm, state, rows):
     errors, memory = expected_by(asm, state.model, rows)
     d, senses, (was, before) = asm.detection.detector_, asm.spec.sensory, state.detection
     white = bounded(errors, d.bound) @ d.whitening
-    vector = was.vector + d.gains[:, None] * (white[:, None] - was.vector)
+    limited, late, waiting = held_back(d.spikes, was.waiting, white)
     evidence = Evidence(
-        vector, was.context + CONTEXT_GAIN * (memory.expected - was.context), was.steps + 1
+        vector=followed(was, limited, late, d.gains),
+        context=was.context + CONTEXT_GAIN * (memory.expected - was.context),
+        steps=was.steps + 1,
+        waiting=waiting,
     )
     ratios = (strength(evidence, d.gains) / d.ceiling) ** d.tail
     _, parts = pool(ratios.reshape(len(rows), -1))

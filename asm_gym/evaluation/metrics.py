@@ -63,7 +63,7 @@ def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
 def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
     """Count incidents before any fault, and their hours; where shares are not kept, all is one cause.
 
-    With an ``event``, ``"knock"`` or ``"stop"``, count the surprise that it excused instead.
+    With an ``event``, such as ``"knock"``, count the surprise that it excused instead.
     """
     count = 0
     hours = 0.0

@@ -271,7 +271,7 @@ def followed(trace: ScoredEpisode, following: FollowingThreshold) -> ScoredEpiso
 
 
 def excused_in(trace: ScoredEpisode) -> dict[str, int]:
-    """Count how often a knock, and a stop, alone kept surprise from being an alarm."""
+    """Count how often each benign event alone kept surprise from being an alarm."""
     return {
         event: len(spans(rows_excused(raw, trace.surprise, trace.threshold)))
         for event, raw in trace.excused.items()

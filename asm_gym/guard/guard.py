@@ -49,6 +49,7 @@ from asm_gym.guard.robot_table import (
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator
 from asm_gym.guard.step_info import Outcome, RowReport
+from asm_gym.guard.wear_watch import WearWatch
 from asm_gym.monitors import Monitor
 from asm_gym.monitors.expectation import LevelShift
 from asm_gym.policies.policy import Policy
@@ -148,6 +149,7 @@ class Guard:
             acts=self._on_alarm != "monitor" and facts.rest.size > 0,
         )
 
+        self._wear = WearWatch(monitor, facts.count)
         self.running = self._arbiter.running
         self._acknowledgements = Acknowledgements(monitor, spec, facts.count)
         self._no_load = no_load(facts.count, facts.felt_size)
@@ -216,6 +218,10 @@ class Guard:
         """Write the memory with the level shifts of a robot that were acknowledged, in a note."""
         self._acknowledgements.save(path, robot)
 
+    def acknowledge_wear(self) -> None:
+        """Forget all wear: the next blocks of operation say what is healthy."""
+        self._wear.acknowledge()
+
     def begin(self, which: Mask | None = None) -> RowReport:
         """Begin new episodes of the robots of ``which`` (n,), all by default; return the empty report."""
         if which is None:
@@ -230,6 +236,7 @@ class Guard:
             self._diagnostician,
             self._limits,
             self._acknowledgements,
+            self._wear,
         ):
             part.begin(which)
         self._warned = {(robot, part) for robot, part in self._warned if not which[robot]}
@@ -238,7 +245,7 @@ class Guard:
     def empty_report(self) -> RowReport:
         """Return the report before the first row of an episode: no alarm, nothing failed."""
         attribution = np.zeros((self._facts.count, self._spec.size))
-        return RowReport(cleared(self.table.records), attribution)
+        return RowReport(cleared(self.table.records), attribution, wear=self._wear.worn)
 
     def sense(self, rows: Floats32) -> None:
         """Tell where the robots are, by rows (n, D) that are not judged."""
@@ -328,6 +335,7 @@ class Guard:
         if to_decide:
             self._acknowledgements.note_alarms(self.table.records["over"], row.attribution)
             self._decide(row)
+        self._wear.follow(row.rows, self.table.records)
         self._prepare_next_step(row)
         report = self._report(row)
         if row.eventful:
@@ -512,7 +520,7 @@ class Guard:
             robots = robots.copy()
             robots[inactive] = cleared(robots[inactive])
         if not row.eventful:
-            return RowReport(robots, row.attribution)
+            return RowReport(robots, row.attribution, wear=self._wear.worn)
         return RowReport(
             robots=robots,
             attribution=row.attribution,
@@ -520,6 +528,7 @@ class Guard:
             failures=merged_failures(row.harmless_failures, row.failures),
             repairs={robot: repair.names for robot, repair in self._validator.repairs.items()},
             lost=row.lost,
+            wear=self._wear.worn,
         )
 
     def _warn(self, robot: int, failure: str, instead: str) -> None:

@@ -25,7 +25,8 @@ from asm_gym.data.alarm_reasons import LATE, SURPRISING, blamed
 from asm_gym.data.bridging import Bridge
 from asm_gym.data.live_rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
-from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
+from asm_gym.detection.alarm_rule import BENIGN_EVENTS, EVENTS, NO_EVENT
+from asm_gym.detection.drift import Wear
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.detection.incidents import AlarmRow, Incident, IncidentBook, power_of
 from asm_gym.guard.adapter import Adapter, SensedRows
@@ -155,6 +156,7 @@ class LiveWatch(Adapter):
         self._no_action = np.zeros((1, spec.motor.size), np.float32)
         self._beat = settings.beat
         self._stamp: float | None = None  # of the newest row, by the robot's own clock [s]
+        self._is_worn = False
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
         self._unreadable_lines = 0
         self._line_book = IncidentBook()  # of unreadable lines, by their arrival
@@ -297,6 +299,7 @@ class LiveWatch(Adapter):
                 self._note(text, cause=cause.name, remedy=cause.remedy)
             self._report_surprise(report, target.numbers)
             self._report_event(EVENTS[report.robots["event"][0]])
+            self._report_wear(report.wear.get(0))
 
     def _report_surprise(self, report: RowReport, numbers: NDArray[np.float64]) -> None:
         """Raise an alarm where surprise over its threshold opens an incident."""
@@ -349,10 +352,16 @@ class LiveWatch(Adapter):
         return self.rows * self._spec.dt
 
     def _report_event(self, event: str) -> None:
-        """Note a knock or a stop when it begins."""
-        if event in (KNOCK, STOP) and event != self._last_event:
+        """Note a knock, a stop or a glitch when it begins."""
+        if event in BENIGN_EVENTS and event != self._last_event:
             self._note(f"{event}: no alarm")
         self._last_event = event
+
+    def _report_wear(self, wear: Wear | None) -> None:
+        """Note wear when it begins."""
+        if wear is not None and not self._is_worn:
+            self._note(f"{wear}; no alarm")
+        self._is_worn = wear is not None
 
     def _alarm(self, text: str, reason: str, **details: Any) -> None:
         """Count and say an alarm."""

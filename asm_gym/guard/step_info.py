@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK_EVENT
+from asm_gym.detection.drift import Wear
 from asm_gym.guard.alarm_terms import ALARM_TERMS
 from asm_gym.guard.arbiter import NO_DECISION, Decision
 from asm_gym.guard.contact_state import severity_info
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
 from asm_gym.guard.robot_table import ENDED, STATES, Mask
+from asm_gym.guard.wear_watch import wear_info
 from asm_gym.spec import StreamSpec
 
 
@@ -45,6 +47,7 @@ class RowReport:
         failures: what failed.
         repairs: the sensors that are not believed.
         lost: the numbers that were not finite.
+        wear: what wears most, told until it is acknowledged.
     """
 
     robots: NDArray[Any]
@@ -53,6 +56,7 @@ class RowReport:
     failures: Mapping[int, str] = field(default_factory=dict)
     repairs: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    wear: Mapping[int, Wear] = field(default_factory=dict)
 
     @property
     def gave_up(self) -> Mask:
@@ -78,7 +82,7 @@ class AsmInfo(TypedDict, total=False):
     alarms: int  # steps in alarm so far in this episode
     reason: str  # the alarm term of the least priority; empty without an alarm
     terms: tuple[str, ...]  # all alarm terms that hold
-    event: str  # "fault", "knock", "stop" (no alarm), or empty
+    event: str  # "fault", "knock", "stop", "glitch" (no alarm), or empty
     state: str  # who acts next
     intervened: bool  # another than the policy acted, in some row
     gave_up: bool  # the episode ends
@@ -94,6 +98,7 @@ class AsmInfo(TypedDict, total=False):
     surprises: NDArray[np.float64]  # (k,) of all rows in this step
     completed: tuple[str, ...]  # the sensors that are not believed now
     lost: tuple[str, ...]  # the numbers that were not finite
+    wear: dict[str, Any]  # what drifts: channel, kind and since_s [s]; no alarm
     preview: dict[str, Any] | None  # of the present chunk of actions
     ceiling: float  # highest threshold, only where it follows the policy
     level: float  # share of episodes so far with a false alarm, likewise
@@ -143,6 +148,7 @@ def asm_info(
         "surprises": surprises,
         "completed": last.repairs.get(robot, ()),
         "lost": last.lost.get(robot, ()),
+        "wear": wear_info(last.wear.get(robot)),
     }
     info.update(step)  # type: ignore[typeddict-item]
     return info

@@ -16,6 +16,7 @@ from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_comparison import refuse_other_scales
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
+from asm_gym.detection.alarm_rule import GLITCH
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
@@ -68,6 +69,7 @@ class CalibratedMonitor:
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
         blocks_: surprise in blocks of time, for promises by the hour (``detection.conformal``).
+        glitch_blocks_: what spikes that were held back would have made of them; None where none are.
         promised_: ``"episode"`` or ``"hour"``, the unit of the promise.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty if the stream has no such channels.
@@ -76,17 +78,20 @@ class CalibratedMonitor:
         commands_: (3, A) least, most and greatest step of the commands of these episodes; None without.
         ranges_: (8, D) how far each number went in these episodes (``detection.healthy_ranges``); None in files of
             earlier versions.
+        wear_: (4, M) how much senses drift between these episodes (``detection.drift``); None without.
     """
 
     model: StreamModel
     threshold_: float | None
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
+    glitch_blocks_: Blocks | None
     healthy_: tuple[float, ...]
     pace_: dict[str, NDArray[np.float32]]
     motion_: NDArray[np.floating[Any]] | None
     commands_: NDArray[np.floating[Any]] | None
     ranges_: NDArray[np.floating[Any]] | None
+    wear_: NDArray[np.floating[Any]] | None
 
     def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
         if not detections:
@@ -310,6 +315,10 @@ class CalibratedMonitor:
         self.promised_ = rate.per
         self.maxima_ = np.array([value.max() for value in values])
         self.blocks_ = blocks
+        events = [surprise.excused_by_event for surprise in surprises]
+        if all(GLITCH in event for event in events):
+            spikes = [event[GLITCH] for event in events]
+            self.glitch_blocks_ = Blocks.of(spikes, self.spec.dt)
 
     def _keep_healthy_ranges(self, episodes: Sequence[Episode]) -> None:
         """Keep the forces, speeds, motion and commands of healthy episodes."""
@@ -318,6 +327,7 @@ class CalibratedMonitor:
         self.pace_ = HandSpeedMap.by_task(episodes, self.spec)
         self.motion_ = learned_motion(streams, self.spec)
         self.commands_ = healthy_commands(streams, self.spec)
+        self.wear_ = self._healthy_wear(streams)
         meaning: ActionMeaning | None = None
         if ACTIONS in self.about:
             meaning = ActionMeaning.from_json(self.about[ACTIONS])
@@ -327,6 +337,10 @@ class CalibratedMonitor:
     def limits(self, margin: float = MARGIN) -> RobotLimits:
         """Return what healthy motion needs, as limits for the robot; raises as ``robot_limits.limits_of`` does."""
         return limits_of(self, margin)
+
+    def _healthy_wear(self, streams: Sequence[NDArray[Any]]) -> NDArray[np.float64] | None:
+        """Return how much senses drift between healthy episodes (T, D); None where nothing tells."""
+        return None
 
     @property
     def threshold(self) -> float:
@@ -353,6 +367,16 @@ class CalibratedMonitor:
         if self.promised_ == HOUR:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
+
+    @property
+    def glitch_promise(self) -> Promise:
+        """The rate of glitches in nominal operation by the hour, which are no alarms (``detection.glitches``).
+
+        Raises NotFitted before ``calibrate``, and where spikes are not held back.
+        """
+        if self.maxima_ is None or self.glitch_blocks_ is None:
+            raise self._lacking("promise of glitches")
+        return hourly_promise(self.glitch_blocks_, self.threshold, len(self.maxima_))
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
         """Return a copy that weighs several judgements against each other by nominal episodes; itself with just one."""
@@ -441,7 +465,9 @@ class CalibratedMonitor:
         arrays_of_model = dict(arrays)
         for detection in self.detections.values():
             if arrays.keys() >= set(detection.arrays):
-                own_arrays = {name: arrays_of_model.pop(name) for name in detection.arrays}
+                optional = getattr(detection, "optional_arrays", ())
+                own_names = [name for name in (*detection.arrays, *optional) if name in arrays]
+                own_arrays = {name: arrays_of_model.pop(name) for name in own_names}
                 detection.restore(own_arrays)
         self.model.restore(arrays_of_model, skills)
         self._place_errors()
@@ -452,12 +478,14 @@ class CalibratedMonitor:
         self.threshold_ = None
         self.maxima_ = None
         self.blocks_ = None
+        self.glitch_blocks_ = None
         self.promised_ = EPISODE
         self.healthy_ = ()
         self.pace_ = {}
         self.motion_ = None
         self.commands_ = None
         self.ranges_ = None
+        self.wear_ = None
 
     @property
     def _name(self) -> str:

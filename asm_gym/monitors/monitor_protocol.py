@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection.alarm_rule import EVENTS, KNOCK, STOP
+from asm_gym.detection.alarm_rule import BENIGN_EVENTS, EVENTS
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 
@@ -26,7 +26,7 @@ class Surprise(NamedTuple):
         value: (B,) number that the threshold applies to; ``inf`` where the row is not finite.
         attribution: (B, D) share of each number of the row; adds up to ``value`` along the last axis.
         skill: (B,) name of the skill that seems to be running; None where no skill has a name.
-        raw: (B,) ``value`` before knocks and stops excuse part of it; None where nothing is excused.
+        raw: (B,) ``value`` before benign events excuse part of it; None where nothing is excused.
         excuse: (B,) index in ``detection.alarm_rule.EVENTS`` of the event that excuses it; None likewise.
     """
 
@@ -54,11 +54,11 @@ class Surprise(NamedTuple):
 
     @property
     def excused_by_event(self) -> dict[str, NDArray[np.float64]]:
-        """``raw`` (B,) of rows excused by a knock, and by a stop, 0 elsewhere; empty where nothing is excused."""
+        """``raw`` (B,) of rows excused by each benign event, 0 elsewhere; empty where nothing is excused."""
         if self.raw is None:
             return {}
         by_event = {}
-        for event in (KNOCK, STOP):
+        for event in BENIGN_EVENTS:
             by_event[event] = np.where(self.excuse == EVENTS.index(event), self.raw, 0.0)
         return by_event
 

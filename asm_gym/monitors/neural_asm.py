@@ -19,6 +19,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
+from asm_gym.detection.drift import DriftSenses, WearCounter, WearScale, wear_scale
 from asm_gym.memory.dynamics import DYNAMICS, RECURRENT
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.blame import Blame
@@ -39,7 +40,12 @@ from asm_gym.monitors.named_causes import CauseNamer
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
-from asm_gym.monitors.torque.arm_features import ArmFeatures, judged_by_values
+from asm_gym.monitors.torque.arm_features import (
+    ArmFeatures,
+    judged_by_values,
+    torque_names,
+    torques_with_speeds,
+)
 from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
 from asm_gym.monitors.weight_packing import rounded
 from asm_gym.scaling import StreamScaler
@@ -65,6 +71,8 @@ class NeuralASM(CalibratedMonitor):
             on every row. ``"traces"``, with fixed decays, is that of memories from earlier versions.
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
+        glitches: let a spike of one group of senses in one row wait for a second row (``detection.glitches``). A memory
+            of an earlier release, learned without, goes on without.
         values: judge values, such as torques, beside changes (``monitors.torque``), if other senses predict them: for
             lasting pushes. None judges them where torques, currents or efforts are among the senses
             (``torque.arm_features.judged_by_values``).
@@ -104,6 +112,7 @@ class NeuralASM(CalibratedMonitor):
         habituates: bool = True,
         dynamics: str = RECURRENT,
         excuses: bool = False,
+        glitches: bool = True,
         values: bool | None = None,
         urdf: str = "",
         seed: int = 0,
@@ -135,7 +144,9 @@ class NeuralASM(CalibratedMonitor):
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         evidence_params = {name: getattr(config, name) for name in OF_EVIDENCE}
-        evidence = EvidenceDetection(spec, habituates=habituates, **evidence_params)
+        evidence = EvidenceDetection(
+            spec, habituates=habituates, glitches=glitches, **evidence_params
+        )
         self.config = self.config.as_checked_by(evidence)
         self.habituates = evidence.habituates
         super().__init__(model, evidence, seed=seed)
@@ -172,6 +183,13 @@ class NeuralASM(CalibratedMonitor):
         return cls.load(pretrained_file(name))
 
     @property
+    def glitches(self) -> bool:
+        """Whether a spike in one row waits for a second one."""
+        evidence = self.detections[EvidenceDetection.name]
+        assert isinstance(evidence, EvidenceDetection)
+        return evidence.glitches
+
+    @property
     def senses_(self) -> StreamScaler:
         """The reader of rows."""
         return self.model.senses_
@@ -185,6 +203,30 @@ class NeuralASM(CalibratedMonitor):
         if self._diagnosis is None or self._diagnosis.completion is not completion:
             self._diagnosis = Diagnosis(completion, Readout.shipped())
         return self._diagnosis
+
+    def wear_counter(self) -> WearCounter | None:
+        """Return what adds up the drift of a robot; None where the memory was calibrated on too few episodes."""
+        senses = self._drift_senses()
+        if senses is None or self.wear_ is None:
+            return None
+        scale = WearScale.restored(np.asarray(self.wear_, np.float64), len(senses.labels))
+        return WearCounter(senses, scale)
+
+    def _drift_senses(self) -> DriftSenses | None:
+        """Return what reads drift, by the completion; None without one."""
+        completion = self.model.completion_
+        if completion is None:
+            return None
+        withheld = np.zeros(self.spec.size, bool)
+        withheld[torque_names(self.spec)] = True
+        return DriftSenses.of(completion, torques_with_speeds(self.spec), withheld)
+
+    def _healthy_wear(self, streams: Sequence[NDArray[Any]]) -> NDArray[np.float64] | None:
+        senses = self._drift_senses()
+        if senses is None:
+            return None
+        scale = wear_scale(senses, streams, self.spec.dt)
+        return None if scale is None else scale.array
 
     @property
     def blame_(self) -> Blame | None:

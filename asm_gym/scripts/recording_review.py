@@ -11,6 +11,7 @@ from typing import Any
 from asm_gym.data.alarm_reasons import SURPRISING
 from asm_gym.data.bridging import bridged
 from asm_gym.data.logs import Log
+from asm_gym.detection.drift import WearCounter, blocks_of
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.evaluation import recorded_alarms
 from asm_gym.evaluation.incident_window import IncidentWindow
@@ -40,6 +41,7 @@ class Review:
     unwritten: str = ""  # why rows around an alarm could not be written
     # Its file is moved on by these recordings; None for a fixed threshold.
     following: FollowingThreshold | None = None
+    wear: WearCounter | None = None  # from episode to episode
 
     def add(self, logs: Sequence[Log], monitor: Any, bridge: float, folder: Path) -> None:
         """Score some recordings, and write the rows around each alarm.
@@ -65,6 +67,9 @@ class Review:
                 )
             self.hours += len(trace) * trace.dt / 3600
             self.excused.update(recorded_alarms.excused_in(trace))
+            if self.wear is not None and not trace.alarm.any():
+                for block in blocks_of(log.episode.stream, monitor.spec.dt):
+                    self.wear.follow(block, monitor.spec.dt)
             self.worst.append(trace)
         self.worst.sort(key=lambda trace: -recorded_alarms.sensed_peak(trace))
         del self.worst[DRAWN_EPISODES:]
@@ -75,6 +80,8 @@ class Review:
         logs = len({alarm.log for alarm in self.alarms})
         parts = [f"{counted(len(self.alarms), 'alarm')} in {logs} of {self.episodes} episodes"]
         parts += [counted(count, event) for event, count in self.excused.items() if count]
+        if self.wear is not None and self.wear.worn:
+            parts.append(str(self.wear.worn[0]))
         return ", ".join(parts)
 
     def _written(self, path: Path, window: IncidentWindow, expectation: Expectation) -> str:

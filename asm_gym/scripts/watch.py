@@ -44,7 +44,7 @@ from asm_gym.guard.live_events import LiveEvent, hold_by_hook, run_hook
 from asm_gym.guard.live_watch import WatchSettings, follow
 from asm_gym.guard.operator_orders import Orders, taken_from, without_orders
 from asm_gym.guard.watchdog import Watchdog
-from asm_gym.monitors import load_monitor
+from asm_gym.monitors import NeuralASM, load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, REFUSED, option, origin, run
 from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
@@ -105,6 +105,8 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     """Score a recording, write its alarms and a report, and print the alarms."""
     following = following_of(args, monitor)
     reviewed = Review(following=following)
+    if isinstance(monitor, NeuralASM):
+        reviewed.wear = monitor.wear_counter()
     bridge = bridge_of(args.bridge, monitor.spec.dt)
     writable(args.out / "alarms.csv")
     progress_console = console

@@ -195,6 +195,10 @@ class Guarding:
             return {}
         return {"ceiling": running.ceiling, "level": running.level}
 
+    def acknowledge_wear(self) -> None:
+        """Forget the wear in ``info["asm"]["wear"]``: the next episodes say what is healthy."""
+        self.guard.acknowledge_wear()
+
     @property
     def latency(self) -> float:
         """How long the monitor took for the last rows [s]."""

@@ -177,6 +177,33 @@ def position_columns(spec: StreamSpec) -> NDArray[np.intp]:
     return np.setdiff1d(named_columns(spec, POSITION_NAME), named_columns(spec, COMMANDED_NAME))
 
 
+def torques_with_speeds(spec: StreamSpec) -> NDArray[np.intp]:
+    """Return (J, 2) columns of torques and of their joints' speeds, where they belong together one by one."""
+    torques = torque_names(spec)
+    torques = torques[np.isin(torques, spec.sensory)]
+    speeds = named_columns(spec, SPEED_NAME)
+    if len(torques) == len(speeds):
+        return np.stack([torques, speeds], axis=1)
+    pairs: list[tuple[int, int]] = []
+    channel_of_speed = None
+    for channel in spec.channels:
+        columns = np.arange(spec.size)[spec.slices[channel.name]]
+        if channel_of_speed is None and np.isin(columns, speeds).all():
+            channel_of_speed = columns  # the first: that of the joints
+    if channel_of_speed is None:
+        return np.zeros((0, 2), np.intp)
+    for channel in spec.channels:
+        columns = np.arange(spec.size)[spec.slices[channel.name]]
+        if len(columns) == len(channel_of_speed) and np.isin(columns, torques).all():
+            pairs += zip(columns.tolist(), channel_of_speed.tolist(), strict=True)
+    return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def torque_names(spec: StreamSpec) -> NDArray[np.intp]:
+    """Return the columns of all torques or currents by their names, sensed and commanded."""
+    return columns_where(spec, lambda channel: bool(TORQUE_NAME.fullmatch(channel.name.lower())))
+
+
 def motion_columns(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of positions and speeds, by their names."""
     return np.union1d(named_columns(spec, POSITION_NAME), named_columns(spec, SPEED_NAME))

@@ -20,10 +20,11 @@ STUDIES = {
     "day": "a simulated day of an arm: incidents against ten events",
     "alarm_causes": "the channel that an alarm points to, and its cause in words, on a simulated arm",
     "hours": "false alarms an hour of a shipped memory; needs a corpus",
+    "wear": "how soon drifting encoders and growing friction are told as wear",
     "real_arms": "faults added to recordings of real arms (to download)",
 }
 
-MODULES = {"panda": "six_skills", "learning": "learning_safely"}
+MODULES = {"panda": "six_skills", "learning": "learning_safely", "wear": "wear_of_an_arm"}
 """Modules of studies that are not named after them."""
 
 
