@@ -119,6 +119,7 @@ def streams() -> list[np.ndarray]:
 
 def memory_of(streams, **settings) -> NeuralASM:
     episodes = [Episode.from_stream(stream, SPEC) for stream in streams]
+    settings = {"glitches": True} | settings
     memory = NeuralASM(SPEC, hidden_size=16, association_size=16, epochs=2, **settings)
     return memory.fit(episodes[:30]).calibrate(episodes[30:], false_alarm_rate=0.05)
 

@@ -125,6 +125,7 @@ def memory(dt=0.05, **settings):
     """A fitted memory, and rows (T, B, D) with which much is wrong."""
     spec = replace(sine_spec(), dt=dt)
     episodes = sine_episodes(12, spec=spec, steps=(60, 60))
+    settings = {"glitches": True} | settings
     asm = NeuralASM(spec, hidden_size=16, association_size=30, epochs=1, **settings).fit(
         episodes[:8]
     )

@@ -87,7 +87,7 @@ class EvidenceDetection:
         shrinkage: float = 1e-3,
         habituates: bool = True,
         tail_index: float = TAIL_INDEX,
-        glitches: bool = True,
+        glitches: bool = False,
     ) -> None:
         self.spec = spec
         self.gains = tuple(check_number("each of gains", a, above=0.0, high=1.0) for a in gains)

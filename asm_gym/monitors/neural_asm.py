@@ -112,7 +112,7 @@ class NeuralASM(CalibratedMonitor):
         habituates: bool = True,
         dynamics: str = RECURRENT,
         excuses: bool = False,
-        glitches: bool = True,
+        glitches: bool = False,
         values: bool | None = None,
         urdf: str = "",
         seed: int = 0,
