@@ -134,7 +134,7 @@ def _work(day: Day, targets: Floats, inverse: Floats) -> Floats:
         reference[0] += day.home[t]
         command = rate * way + GAIN * (reference - q)
         before = v
-        q, v, torque = _advance(q, v, command, (day.load[t], 0.0), inverse)
+        q, v, torque = _advance(q, v, command, (day.load[t], 0.0, 1.0), inverse)
 
         gripping = (k % 5 == 1) or (k % 5 == 2)
         goal = CLOSED if gripping else OPEN
