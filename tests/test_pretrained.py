@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from asm_gym.monitors import NeuralASM, pretrained, pretrained_for
@@ -86,6 +87,11 @@ def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
     envs = VectorNeuralASMSafety(gym.make_vec("asm_gym/Lift-v0", 1, vectorization_mode="sync"))
     assert env.monitor.about["name"] == envs.monitor.about["name"] == "panda"
     assert env.threshold == envs.threshold == NeuralASM.pretrained("panda").threshold
+    _, at_reset = env.reset(seed=0)
+    after_a_step = env.step(np.zeros(7, np.float32))[4]
+    assert {name: np.shape(value) for name, value in at_reset.items()} == {
+        name: np.shape(value) for name, value in after_a_step.items()
+    }
     env.close()
     envs.close()
 

@@ -55,10 +55,10 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         self.keeps_holding = False
         """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
         self.contact_limits: ContactLimits | None = None
-        """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then tells ``contact_load``,
+        """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then has ``contact_load``,
         the largest share of a limit that was reached within the step, ``contact_left_s``, when in it a limit was passed
         [s], infinite where none was, ``contact_felt``, the step's mean load, and ``braked``, the share of its substeps
-        in which an arm was slowed down beneath its controller; without limits these are NaN, and ``braked`` 0."""
+        in which an arm was slowed down beneath its controller, 0 without limits."""
         self._limits_of_guards: dict[str, ContactLimits | None] = {}
 
     @property
@@ -162,12 +162,8 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         )
 
     def _forces(self, unstable: bool) -> dict[str, Any]:
-        """Return what ``info`` says of contact and wear.
-
-        It is NaN without limits; NaN or infinite where the simulation diverged.
-        """
+        """Return what ``info`` says of contact and wear; NaN or infinite where the simulation diverged."""
         simulation = self.simulation
-        felt = simulation.felt_mean
         wear = simulation.wear.read()
         forces: dict[str, Any] = {
             "contact_force": simulation.contact_force,
@@ -175,9 +171,6 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             "joint_stops": wear.joint_stops,
             "self_contacts": wear.self_contacts,
             "braked": 0.0,
-            "contact_load": np.nan,
-            "contact_left_s": np.nan,
-            "contact_felt": np.full_like(felt, np.nan),
         }
         if self.contact_limits is not None:
             forces["braked"] = simulation.braked
@@ -185,7 +178,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             forces["contact_left_s"] = np.inf
             if simulation.passed_limit is not None:
                 forces["contact_left_s"] = (simulation.passed_limit + 1) / PHYSICS_FREQ
-            forces["contact_felt"] = felt
+            forces["contact_felt"] = simulation.felt_mean
         if unstable:
             forces["contact_force"] = np.nan
             forces["contact_impulse"] = np.nan

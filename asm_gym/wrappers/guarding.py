@@ -315,6 +315,15 @@ def sensed_row(read: Callable[[], Any], size: int) -> tuple[NDArray[np.float32],
     return row, ""
 
 
+def nothing_felt(size: int) -> dict[str, Any]:
+    """Return what ``info`` says of contact before the first step, of ``size`` numbers that are felt."""
+    return {
+        "contact_load": np.nan,
+        "contact_left_s": np.nan,
+        "contact_felt": np.full(size, np.nan),
+    }
+
+
 def load_felt(
     facts: RobotFacts,
     infos: Mapping[str, Any],

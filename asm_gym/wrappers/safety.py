@@ -21,7 +21,13 @@ from asm_gym.monitors import Monitor
 from asm_gym.policies.hold import HoldsItself, why_changed
 from asm_gym.stream_source import StepResult, StreamSource
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.guarding import Guarding, as_action, load_felt, sensed_row
+from asm_gym.wrappers.guarding import (
+    Guarding,
+    as_action,
+    load_felt,
+    nothing_felt,
+    sensed_row,
+)
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -152,6 +158,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._ended = False
         self._executed = np.zeros(0, np.float32)
         info["overridden"] = bool(info.get("overridden"))
+        if getattr(self.env.unwrapped, "contact_limits", None) is not None:
+            info |= nothing_felt(self._facts.felt_size)
         if "success" in info:
             info.setdefault("is_success", bool(info["success"]))
         self.report_step([report], info)
