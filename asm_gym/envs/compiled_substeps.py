@@ -336,6 +336,18 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
     return largest
 
 
+@compiled
+def summed_excess(samples: Floats, count: int, limit: float) -> float:
+    """Return the contact force beyond ``limit`` [N], summed over the first ``count`` substeps."""
+    total = 0.0
+    for k in range(count):
+        force = 0.0
+        for a in range(len(samples)):
+            force = larger(force, length(samples[a, k, _CONTACT:_VELOCITY]))
+        total += max(force - limit, 0.0)
+    return total
+
+
 @inner
 def larger(number: float, other: float) -> float:
     """Return the number of larger magnitude; NaN where one is NaN."""

@@ -39,7 +39,7 @@ from asm_gym.envs.mujoco_views import (
 )
 from asm_gym.envs.nominal_dynamics import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
-from asm_gym.envs.wear import WearSensor
+from asm_gym.envs.strain import StrainSensor
 from asm_gym.spec import Channel
 
 
@@ -75,7 +75,7 @@ class Simulation:
         )
         self._motion_limits_set: ContactLimits | None = None
         self.proprioception = Proprioception(self.parts, self.views, self.data)
-        self.wear = WearSensor(self.parts, self.model, self.data)
+        self.strain = StrainSensor(self.parts, self.model, self.data)
         self.contact_force = 0.0
         """The largest net contact force on an arm within the control step [N]. In the sum over its bodies a grasp's own
         squeeze cancels; loads that a fault applies are left out."""
@@ -302,8 +302,9 @@ class Simulation:
     @property
     def contact_impulse(self) -> float:
         """Contact force beyond ``FREE_FORCE``, summed over the substeps of the control step so far [N s]."""
-        excess = np.maximum(self.contact_forces - FREE_FORCE, 0.0)
-        return self._impulse_of_earlier_rows + float(excess.sum()) / PHYSICS_FREQ
+        count = self._substeps_done - self._row_start
+        excess = kernels.summed_excess(self._samples, count, FREE_FORCE)
+        return self._impulse_of_earlier_rows + excess / PHYSICS_FREQ
 
     def sense(self, other_values: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
         """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began.

@@ -162,14 +162,14 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         )
 
     def _forces(self, unstable: bool) -> dict[str, Any]:
-        """Return what ``info`` says of contact and wear; NaN or infinite where the simulation diverged."""
+        """Return what ``info`` says of contact and strain; NaN or infinite where the simulation diverged."""
         simulation = self.simulation
-        wear = simulation.wear.read()
+        strain = simulation.strain.read()
         forces: dict[str, Any] = {
             "contact_force": simulation.contact_force,
             "contact_impulse": simulation.contact_impulse,
-            "joint_stops": wear.joint_stops,
-            "self_contacts": wear.self_contacts,
+            "joint_stops": strain.joint_stops,
+            "self_contacts": strain.self_contacts,
             "braked": 0.0,
         }
         if self.contact_limits is not None:

@@ -28,7 +28,7 @@ class GuardedStep(NamedTuple):
 
     @classmethod
     def of(cls, info: dict[str, Any]) -> GuardedStep:
-        """Return the step that an ``info`` describes; what wears the arm is 0 where nothing measures it."""
+        """Return the step that an ``info`` describes; what strains the arm is 0 where nothing measures it."""
         return cls(
             surprise=float(info["asm_surprise"]) / float(info["asm"]["threshold"]),
             alarm=bool(info["asm_alarm"]),

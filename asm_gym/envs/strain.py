@@ -1,4 +1,4 @@
-"""What wears a robot beside the force of its contacts: joints at their stops, and parts of it that touch each other."""
+"""How a robot is strained beside the force of its contacts: joints at their stops, and parts of it that touch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from asm_gym.compilation import compiled
 from asm_gym.envs.arms import Part, bodies
-from asm_gym.envs.mujoco_views import Ints
+from asm_gym.envs.mujoco_views import Floats, Ints
 
 AT_STOP = 0.01  # a joint so near to the end of its range is at its stop [rad]
 
@@ -19,15 +19,15 @@ GRIPPER = 1
 LINK = 2  # of an arm, or its base
 
 
-class Wear(NamedTuple):
+class Strain(NamedTuple):
     """The state of robots at one moment."""
 
     joint_stops: int  # joints at their stops
     self_contacts: int  # contacts between two parts of robots, without those within a gripper
 
 
-class WearSensor:
-    """Reads the wear of the robots in one loaded model.
+class StrainSensor:
+    """Counts the strain of the robots in one loaded model.
 
     Args:
         parts: the arms.
@@ -52,12 +52,24 @@ class WearSensor:
             kind_of_body[_descendants(model, gripper)] = GRIPPER
         self._kinds = kind_of_body[model.geom_bodyid]
 
-    def read(self) -> Wear:
-        """Return the wear now."""
-        angles = self._data.qpos[self._angles]
-        stops = np.count_nonzero((angles < self._low) | (angles > self._high))
-        touching = self_contacts(self._data.contact.geom, self._kinds)
-        return Wear(joint_stops=int(stops), self_contacts=touching)
+    def read(self) -> Strain:
+        """Return the strain now."""
+        stops = joints_at_stops(self._data.qpos, self._angles, self._low, self._high)
+        touching = 0
+        if self._data.ncon:
+            touching = self_contacts(self._data.contact.geom, self._kinds)
+        return Strain(joint_stops=stops, self_contacts=touching)
+
+
+@compiled
+def joints_at_stops(positions: Floats, places: Ints, low: Floats, high: Floats) -> int:
+    """Return how many joints, at ``places`` (J,) of the positions, are below ``low`` or above ``high`` (J,)."""
+    count = 0
+    for n in range(len(places)):
+        angle = positions[places[n]]
+        if angle < low[n] or angle > high[n]:
+            count += 1
+    return count
 
 
 @compiled

@@ -1,11 +1,11 @@
-"""What wears an arm: contact force over time, joints at their stops, and a robot that touches itself."""
+"""What strains an arm: contact force over time, joints at their stops, and a robot that touches itself."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
-from asm_gym.envs.wear import AT_STOP, GRIPPER, LINK, self_contacts
+from asm_gym.envs.strain import AT_STOP, GRIPPER, LINK, self_contacts
 from asm_gym.policies import make_policy, rollout
 
 DOWN = np.array([0, 0, -1, 0, 0, 0, 1], np.float32)
@@ -36,12 +36,12 @@ def test_a_joint_at_its_stop_counts():
     env = gym.make("asm_gym/Lift-v0")
     env.reset(seed=0)
     simulation = env.unwrapped.simulation
-    assert simulation.wear.read() == (0, 0)
+    assert simulation.strain.read() == (0, 0)
     joint = env.unwrapped.robosuite_env.robots[0]._ref_joint_indexes[1]
     simulation.data.qpos[simulation.model.jnt_qposadr[joint]] = (
         simulation.model.jnt_range[joint, 1] - 0.5 * AT_STOP
     )
-    assert simulation.wear.read().joint_stops == 1
+    assert simulation.strain.read().joint_stops == 1
     env.close()
 
 
