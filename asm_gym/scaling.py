@@ -133,8 +133,7 @@ class StreamScaler:
     @cached_property
     def groups(self) -> NDArray[np.intp]:
         """(X,) the group of each change, by number; where all are of one group, every number is its own."""
-        names = [channel.group for channel in self.spec.channels for _ in channel.labels]
-        sensory_names = np.array(names)[self.spec.sensory]
+        sensory_names = np.array(self.spec.groups)[self.spec.sensory]
         _, groups = np.unique(sensory_names, return_inverse=True)
         if not groups.any():  # one group, of number 0
             return np.arange(len(groups))

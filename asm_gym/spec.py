@@ -162,6 +162,11 @@ class StreamSpec:
         """D units, one for each of ``labels``."""
         return tuple(self._of_each_number("unit"))
 
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """D groups, one for each of ``labels``."""
+        return tuple(self._of_each_number("group"))
+
     @cached_property
     def noise(self) -> NDArray[np.float64]:
         """(D,) standard deviation of the sensor noise [unit of each channel]."""
@@ -175,7 +180,7 @@ class StreamSpec:
     @cached_property
     def motor(self) -> NDArray[np.intp]:
         """Indices of the commanded action, which a policy gives."""
-        return np.flatnonzero([group == MOTOR for group in self._of_each_number("group")])
+        return np.flatnonzero([group == MOTOR for group in self.groups])
 
     @cached_property
     def commanded(self) -> NDArray[np.intp]:

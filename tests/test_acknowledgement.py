@@ -17,8 +17,9 @@ from asm_gym.detection.adaptive import AdaptiveThreshold
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.evaluation.recorded_alarms import alarms_of, by_hour, traces_of
 from asm_gym.guard.live_events import LiveEvent
-from asm_gym.guard.live_watch import WatchSettings, follow
+from asm_gym.guard.live_watch import follow
 from asm_gym.guard.operator_orders import ACKNOWLEDGE, SNOOZE, Order, order_in, without_orders
+from asm_gym.guard.watch_settings import WatchSettings
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.expectation import Expectation, shifts_kept_in
 from asm_gym.scripts.cli import main

@@ -41,9 +41,8 @@ def row(
 def opened(*rows: AlarmRow) -> list[tuple[float, int | None, str]]:
     """Start, channel and reason of the incidents of rows."""
     book = IncidentBook(POWER)
-    for each in rows:
-        book.follow(each)
-    return [(i.start, i.column, i.reason) for i in book.incidents]
+    incidents = [book.follow(each) for each in rows]
+    return [(i.start, i.column, i.reason) for i in incidents if i is not None]
 
 
 def test_what_continues_or_returns_within_a_minute_is_one_incident_and_later_another():

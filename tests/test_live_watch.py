@@ -27,7 +27,8 @@ from asm_gym.evaluation.recorded_alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.guard.alarm_outlets import AlarmOutlets, LineWriter
 from asm_gym.guard.live_events import LiveEvent
-from asm_gym.guard.live_watch import WatchSettings, follow
+from asm_gym.guard.live_watch import follow
+from asm_gym.guard.watch_settings import WatchSettings
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec

@@ -91,13 +91,9 @@ class IncidentBook:
 
     Args:
         power: p, how the detection pools its channels; 1 for a sum.
-
-    Attributes:
-        incidents: all of them, in the order of their starts.
     """
 
     def __init__(self, power: float = 1.0) -> None:
-        self.incidents: list[Incident] = []
         self._power = power
         self._open: list[Incident] = []
         self._is_after_gap = False  # every row in alarm since a gap has followed another
@@ -204,7 +200,6 @@ class IncidentBook:
             excess=excess,
             settled=time + SETTLING_S,
         )
-        self.incidents.append(incident)
         self._open.append(incident)
         return incident
 
@@ -291,11 +286,13 @@ def incidents_in(
     if shares_of is None:
         return alarms_in(surprise, threshold, dt)
     book = IncidentBook(power)
+    count = 0
     over = rows_over(surprise, threshold)
     for index in np.flatnonzero(over):
         shares = np.asarray(shares_of(int(index)), np.float64)
         numbers = np.where(np.isfinite(shares), 0.0, np.nan)
         time = float((index + 1) * dt)
         follows = bool(index and over[index - 1])
-        book.follow(AlarmRow(time, numbers, shares, float(surprise[index]), threshold, follows))
-    return len(book.incidents)
+        row = AlarmRow(time, numbers, shares, float(surprise[index]), threshold, follows)
+        count += book.follow(row) is not None
+    return count

@@ -107,6 +107,7 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
         return blamed(trace.stream[row], trace.attribution[row])
 
     book = IncidentBook(trace.power)
+    incidents = []  # they grow as long as rows follow
     for row in rows_of_alarm(
         surprise=trace.surprise,
         shares_of=trace.raw_shares,
@@ -115,9 +116,11 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
         dt=trace.dt,
         blame_of=blame_of,
     ):
-        book.follow(row)
+        opened = book.follow(row)
+        if opened is not None:
+            incidents.append(opened)
     alarms = []
-    for incident in book.incidents:
+    for incident in incidents:
         alarm = _alarm(trace, incident)
         if expectation is not None:
             rows = trace.stream[max(alarm.row - 1, 0) : alarm.row + 1]
@@ -212,7 +215,6 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
     dt = monitor.spec.dt
     about = getattr(monitor, "about", {})
     names = LogSchema.kept_in(about, monitor.spec).names_in_logs
-    groups = tuple(c.group for c in monitor.spec.channels for _ in c.labels)
     shift = shift_of_columns(monitor.spec, shifts_kept_in(about))
     surprises = monitor.score_episodes([recentred(log.episode, shift) for log in logs])
     blame = getattr(monitor, "blame_", None)
@@ -232,7 +234,7 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
             excused=judged.excused_by_event,
             attribution=judged.attribution,
             channels=names,
-            groups=groups,
+            groups=monitor.spec.groups,
             power=power_of(monitor),
             fault=fault,
             stream=episode.stream,

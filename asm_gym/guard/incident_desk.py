@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from queue import Empty
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,9 @@ from asm_gym.guard.guard import Guard
 from asm_gym.guard.incident_recorder import IncidentRecorder, KeptRow
 from asm_gym.guard.operator_orders import ACKNOWLEDGE, Order
 from asm_gym.guard.step_info import RowReport
+from asm_gym.guard.watch_settings import WatchSettings
 from asm_gym.monitors.expectation import Expectation, Expected
 from asm_gym.spec import StreamSpec
-
-if TYPE_CHECKING:
-    from asm_gym.guard.live_watch import WatchSettings
 
 ALL = "all"  # channels that are acknowledged
 RETRY_S = 5.0  # time between two attempts to acknowledge a channel [s]
@@ -64,7 +61,7 @@ class IncidentDesk:
         self._recorder = IncidentRecorder(
             settings.evidence, names, self._spec.dt, self._expectation
         )
-        self._numbers: dict[int, Incident] = {}  # incidents by number
+        self._numbers: dict[int, Incident] = {}  # incidents that may be open, by number
         self._waiting: dict[int, float] = {}  # when to try next to acknowledge each [s]
         self._said: set[str] = set()  # problems that were noted
         self._is_kept = True  # every level shift is saved
@@ -79,6 +76,7 @@ class IncidentDesk:
         self, incident: Incident, numbers: NDArray[np.float64], number: int
     ) -> IncidentDetails:
         """Return what is known of an incident that the row (D,) opens."""
+        self._forget_ended(incident.start)
         self._numbers[number] = incident
         column = incident.column
         if self._settings.acknowledges:
@@ -88,12 +86,19 @@ class IncidentDesk:
         if column is None:
             return IncidentDetails(channel="", in_words="", fields=fields)
         channel = self._names[column]
-        fields |= {"channel": channel, "group": _group_of(self._spec, column)}
+        fields |= {"channel": channel, "group": self._spec.groups[column]}
         expected = self._expected(numbers, column)
         if expected is None:
             return IncidentDetails(channel=channel, in_words="", fields=fields)
         fields |= expected._asdict() | {"sign": expected.sign}
         return IncidentDetails(channel=channel, in_words=f"  {expected}", fields=fields)
+
+    def _forget_ended(self, time: float) -> None:
+        """Forget the incidents that have ended: a watch may run for months."""
+        ended = [number for number, each in self._numbers.items() if not each.is_open(time)]
+        for number in ended:
+            del self._numbers[number]
+            self._waiting.pop(number, None)
 
     def _expected(self, numbers: NDArray[np.float64], column: int) -> Expected | None:
         """Return a column of a row (D,) beside what is expected; None if unknown: no error may hold up an alarm."""
@@ -141,12 +146,8 @@ class IncidentDesk:
     def _obey(self, time: float, book: IncidentBook) -> None:
         """Carry out the orders that have come."""
         orders = self._settings.orders
-        while orders is not None:
-            try:
-                order = orders.get_nowait()
-            except Empty:
-                return
-            self._carry_out(order, time, book)
+        while orders is not None and not orders.empty():
+            self._carry_out(orders.get(), time, book)
 
     def _carry_out(self, order: Order, time: float, book: IncidentBook) -> None:
         """Carry out an order, and note what was done or why not."""
@@ -230,9 +231,3 @@ class IncidentDesk:
         if problem not in self._said:
             self._said.add(problem)
             self._note(problem)
-
-
-def _group_of(spec: StreamSpec, column: int) -> str:
-    """Return the group of a column."""
-    groups = [channel.group for channel in spec.channels for _ in channel.labels]
-    return groups[column]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from queue import Empty, Full, Queue
+from queue import Full, Queue
 from threading import Thread
 from typing import Any, NamedTuple
 
@@ -102,11 +102,9 @@ class IncidentRecorder:
     def problems(self) -> list[str]:
         """Return what went wrong since this was last asked."""
         found = []
-        while True:
-            try:
-                found.append(self._problems.get_nowait())
-            except Empty:
-                return found
+        while not self._problems.empty():
+            found.append(self._problems.get())
+        return found
 
     def close(self) -> None:
         """Write the windows that are open, and wait, at most ``LAST_S``, until all are written."""

@@ -88,3 +88,10 @@ def run_hook(command: str, event: LiveEvent) -> None:
 def hold_by_hook(command: str, why: str) -> None:
     """Run a shell command as ``run_hook`` does, for a watchdog that reports ``why``."""
     run_hook(command, LiveEvent(ALARM, 0.0, f"{why}: an alarm", WATCHDOG))
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number of things: ``1 row``, ``2 rows``."""
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count} {noun}s"

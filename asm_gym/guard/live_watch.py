@@ -12,10 +12,8 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +25,6 @@ from asm_gym.data.live_rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
 from asm_gym.detection.alarm_rule import BENIGN_EVENTS, EVENTS, NO_EVENT
 from asm_gym.detection.drift import Wear
-from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.detection.incidents import AlarmRow, Incident, IncidentBook, power_of
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.guard import Guard
@@ -43,11 +40,12 @@ from asm_gym.guard.live_events import (
     UNREADABLE,
     WATCHDOG,
     LiveEvent,
+    counted,
 )
-from asm_gym.guard.operator_orders import Orders
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.step_info import RowReport
+from asm_gym.guard.watch_settings import USUAL, WatchSettings
 from asm_gym.monitors.blame import FollowedBlame
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32
@@ -56,33 +54,6 @@ MOST_LOST = 1000  # lost rows that a bridge is asked about one by one
 LATENCIES = 10_000  # newest rows whose latency is kept
 RETRY_S = 0.2  # time between two attempts to open a source again [s]
 LONGEST_PROBLEM = 200  # characters of an unreadable line's problem in its alarm
-
-
-@dataclass(frozen=True, kw_only=True)
-class WatchSettings:
-    """How a live source is watched.
-
-    ``reopen(first_s)`` opens the source anew; its first line may take ``first_s`` [s].
-    """
-
-    bridge_s: float = 0.0  # longest time for which numbers may be missing without an alarm [s]
-    reopen: Callable[[float], Iterator[str]] | None = None  # opens the source anew
-    wait_s: float = 0.0  # for how long a watch tries to open the source anew [s]
-    until_alarm: bool = False  # the first alarm ends the watch
-    beat: Callable[[], bool] | None = None  # tells a watchdog of a row; whether the watchdog lives
-    clock: str = ""  # column of times; by default the first that has a clock's name
-    silence_s: float = 2.0  # after which the numbers of one of several publishers are missing [s]
-    schema: LogSchema | None = None  # how lines are read; by default that of the memory
-    evidence: Path | None = None  # folder for the rows around each incident
-    orders: Orders | None = None  # of a person: acknowledge or snooze
-    acknowledges: tuple[
-        str, ...
-    ] = ()  # channels whose level shifts are learned once they are steady
-    keep: Path | None = None  # file for the memory with the level shifts that were learned
-    following: FollowingThreshold | None = None  # the threshold that follows
-
-
-USUAL = WatchSettings()
 
 
 def follow(
@@ -409,10 +380,3 @@ def _opened(reopen: Callable[[float], Iterator[str]], first_s: float) -> Iterabl
     except (OSError, SourceDied, StopIteration):
         return None
     return chain([first_line], lines)
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a number of things: ``1 row``, ``2 rows``."""
-    if count == 1:
-        return f"1 {noun}"
-    return f"{count} {noun}s"

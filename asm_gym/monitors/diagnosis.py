@@ -165,8 +165,7 @@ class Diagnosis:
     @cached_property
     def _groups(self) -> NDArray[np.str_]:
         """The group (D,) of each column."""
-        channels = self.completion.spec.channels
-        return np.array([channel.group for channel in channels for _ in channel.labels])
+        return np.array(self.completion.spec.groups)
 
     @cached_property
     def _freed(self) -> list[FreedEntries]:

@@ -96,7 +96,7 @@ class Expectation:
             sensed=float(rows[-1, column]),
             expected=float(values[-1]),
             plus_minus=error,
-            unit=self.unit(column),
+            unit=self._spec.units[column],
         )
 
     def level_shift(self, rows: Numbers, column: int | None, date: str = "") -> LevelShift:
@@ -118,21 +118,13 @@ class Expectation:
             raise ValueError(f"{label} has too few rows to learn a level from: {len(deviation)}")
         shift = float(np.median(deviation))
         low, high = np.quantile(deviation, [0.1, 0.9])
-        unit = self.unit(column)
+        unit = self._spec.units[column]
         if abs(shift) <= LEAST_ERRORS * error or high - low > MOST_SPREAD * abs(shift):
             raise ValueError(
                 f"{label} is not steady at another level: it is {shift:+.3g} {unit} from what is "
                 f"expected, between {low:+.3g} and {high:+.3g}, with an error of {error:.2g}"
             )
         return LevelShift(channel=label, shift=shift, unit=unit, date=date)
-
-    def unit(self, column: int) -> str:
-        """Return the unit of a column."""
-        for channel in self._spec.channels:
-            place = self._spec.slices[channel.name]
-            if place.start <= column < place.stop:
-                return channel.unit
-        return ""
 
     def _filling(self, completion: Completion, column: int) -> Filling:
         """Return how the sensor of a column is completed."""

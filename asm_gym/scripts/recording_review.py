@@ -11,6 +11,7 @@ from typing import Any
 from asm_gym.data.alarm_reasons import SURPRISING
 from asm_gym.data.bridging import bridged
 from asm_gym.data.logs import Log
+from asm_gym.data.reader_notes import note
 from asm_gym.detection.drift import WearCounter, blocks_of
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.evaluation import recorded_alarms
@@ -18,8 +19,7 @@ from asm_gym.evaluation.incident_window import IncidentWindow
 from asm_gym.evaluation.recorded_alarms import HEADINGS, Alarm
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.files import write_text
-from asm_gym.guard.live_events import ALARM, NOTE, SUMMARY, LiveEvent
-from asm_gym.guard.live_watch import counted
+from asm_gym.guard.live_events import ALARM, NOTE, SUMMARY, LiveEvent, counted
 from asm_gym.monitors.expectation import Expectation
 
 MOST_PRINTED = 20  # alarms of a recording; the file holds them all
@@ -38,7 +38,6 @@ class Review:
     excused: Counter[str] = field(default_factory=Counter)  # events that were no alarms
     bridged_rows: int = 0
     hours: float = 0.0
-    unwritten: str = ""  # why rows around an alarm could not be written
     # Its file is moved on by these recordings; None for a fixed threshold.
     following: FollowingThreshold | None = None
     wear: WearCounter | None = None  # from episode to episode
@@ -89,7 +88,7 @@ class Review:
         try:
             write_text(path, window.to_csv(expectation))
         except (OSError, ValueError) as error:
-            self.unwritten = f"the rows around an alarm cannot be written: {error}"
+            note(f"the rows around an alarm cannot be written: {error}")
             return ""
         return f"{path.parent.name}/{path.name}"
 

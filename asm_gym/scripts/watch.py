@@ -41,8 +41,9 @@ from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
 from asm_gym.guard.alarm_outlets import AlarmOutlets, LineWriter, say_aside
 from asm_gym.guard.live_events import LiveEvent, hold_by_hook, run_hook
-from asm_gym.guard.live_watch import WatchSettings, follow
+from asm_gym.guard.live_watch import follow
 from asm_gym.guard.operator_orders import Orders, taken_from, without_orders
+from asm_gym.guard.watch_settings import WatchSettings
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import NeuralASM, load_monitor
 from asm_gym.rollouts.progress import stage
@@ -78,7 +79,7 @@ class Args(LogOptions):
     """End at the first alarm of a live source, with exit code 1: asm-gym watch ... --until-alarm || stop."""
     json: bool = False
     """Print events as JSON lines: kind, time, text, stamp, date, log, reason, channel, thresholds, latency_ms,
-    incident, group, sign, sensed, expected, plus_minus, unit, evidence."""
+    cause, remedy, incident, group, sign, sensed, expected, plus_minus, unit, evidence."""
     hook: str | None = option(None, metavar="COMMAND")
     """Shell command to run at every alarm of a live source; it gets the alarm as JSON on its standard input."""
     topic: str = option("", metavar="TOPIC")
