@@ -72,6 +72,15 @@ class Incident:
         self.settled = time + SETTLING_S
         self.snoozed = time + FADING_S
 
+    def add_channels(self, strengths: Floats, known: Mask) -> None:
+        """Add the channels of a row, of these strengths (D,), but for those that are ``known`` (D,)."""
+        self.known |= (strengths > TOUCHED) & ~known
+        others = self.known.copy()
+        if self.column is not None:
+            others[self.column] = False
+        if others.any():
+            self.spread = max(self.spread, float(strengths[others].max()))
+
 
 @dataclass(frozen=True, slots=True)
 class AlarmRow:
@@ -84,6 +93,11 @@ class AlarmRow:
     threshold: float
     follows: bool = False  # the row before was in alarm too
     column: int | None = None  # that blame points to; None where it was not asked
+
+    @property
+    def excess(self) -> float:
+        """Surprise, in thresholds."""
+        return float(self.surprise / self.threshold)
 
 
 class IncidentBook:
@@ -110,42 +124,26 @@ class IncidentBook:
     def follow(self, row: AlarmRow) -> Incident | None:
         """Take up a row in alarm; return the incident that it opens, None where it belongs to one."""
         why = reason(row.numbers)
-        excess = float(row.surprise / row.threshold)
         if why != SURPRISING:
-            return self._follow_broken(row, why, excess)
+            return self._follow_broken(row, why)
+        if self._belongs_to_gap(row):
+            return None
 
+        surprising = [i for i in self.open_at(row.time) if i.reason == SURPRISING]
         strengths = strengths_of(row, self._power)
-        open_now = self.open_at(row.time)
-        gaps = [i for i in open_now if row.time - i.gap <= SETTLING_S]
-        if row.follows and self._is_after_gap and gaps:
-            return None  # the surprise of a gap
-        self._is_after_gap = False
-        surprising = [i for i in open_now if i.reason == SURPRISING]
         if not surprising:
-            column = row.column
-            if column is None:
-                column = blamed(row.numbers, row.shares)
-            return self._opened(row, SURPRISING, column, strengths > TOUCHED, excess)
-
+            return self._open_first(row, strengths)
         known = np.logical_or.reduce([i.known for i in surprising])
+        settling = [i for i in surprising if i.settles(row.time)]
         rest = np.where(known, 0.0, strengths)
         allowed = max(1.0, *(SPREAD * i.spread for i in surprising))
-        young = [i for i in surprising if i.settles(row.time)]
-        if not young and pooled(rest, self._power) > allowed:
-            touched = (rest > TOUCHED) | (rest == rest.max())
-            column = row.column
-            if column is None or known[column]:
-                column = int(np.argmax(rest))
-            return self._opened(row, SURPRISING, column, touched, excess)
+        if not settling and pooled(rest, self._power) > allowed:
+            return self._open_elsewhere(row, rest, known)
 
-        owner = max(surprising, key=lambda i: pooled(strengths[i.known], self._power))
-        if young:
-            _spread(young[-1], strengths, known)
-        for incident in surprising:
-            own_strength = pooled(strengths[incident.known], self._power)
-            if incident is owner or own_strength > 1.0:
-                incident.last = row.time
-                incident.excess = max(incident.excess, min(own_strength, excess))
+        owner = max(surprising, key=lambda i: self._strength_in(i, strengths))
+        if settling:
+            settling[-1].add_channels(strengths, known)
+        self._prolong(surprising, owner, row, strengths)
         return None
 
     def note(self, why: str, time: float) -> Incident | None:
@@ -156,7 +154,13 @@ class IncidentBook:
                 return None
         return self._add(why, None, time, np.zeros(0, np.bool_), math.inf)
 
-    def _follow_broken(self, row: AlarmRow, why: str, excess: float) -> Incident | None:
+    def _belongs_to_gap(self, row: AlarmRow) -> bool:
+        """Return whether the surprise of a row comes from a gap shortly before; keep that for the next row."""
+        gaps = [i for i in self.open_at(row.time) if row.time - i.gap <= SETTLING_S]
+        self._is_after_gap = self._is_after_gap and row.follows and bool(gaps)
+        return self._is_after_gap
+
+    def _follow_broken(self, row: AlarmRow, why: str) -> Incident | None:
         """Take up a row with numbers that are missing or not finite."""
         self._is_after_gap = True
         broken = ~np.isfinite(row.numbers)
@@ -167,25 +171,54 @@ class IncidentBook:
                 incident.gap = row.time
         if any(i.settles(row.time) for i in same):
             same[-1].known |= broken
-        elif not same or (broken & ~np.logical_or.reduce([i.known for i in same])).any():
-            for incident in same:
-                broken = broken & ~incident.known
-            column = None
-            if not broken.all():
-                column = int(np.argmax(broken))
-            opened = self._opened(row, why, column, broken, excess)
-            opened.gap = row.time
-            return opened
-        return None
+            return None
 
-    def _opened(
-        self, row: AlarmRow, why: str, column: int | None, known: Mask, excess: float
-    ) -> Incident:
+        new = broken.copy()
+        for incident in same:
+            new &= ~incident.known
+        if same and not new.any():
+            return None
+        column = None
+        if not new.all():
+            column = int(np.argmax(new))
+        opened = self._open_by(row, why, column, new)
+        opened.gap = row.time
+        return opened
+
+    def _open_first(self, row: AlarmRow, strengths: Floats) -> Incident:
+        """Open an incident by a row of these strengths (D,), where no other surprises."""
+        column = row.column
+        if column is None:
+            column = blamed(row.numbers, row.shares)
+        return self._open_by(row, SURPRISING, column, strengths > TOUCHED)
+
+    def _open_elsewhere(self, row: AlarmRow, rest: Floats, known: Mask) -> Incident:
+        """Open an incident by the strengths (D,) of a row that are in none of the ``known`` channels (D,)."""
+        touched = (rest > TOUCHED) | (rest == rest.max())
+        column = row.column
+        if column is None or known[column]:
+            column = int(np.argmax(rest))
+        return self._open_by(row, SURPRISING, column, touched)
+
+    def _prolong(
+        self, incidents: list[Incident], owner: Incident, row: AlarmRow, strengths: Floats
+    ) -> None:
+        """Add a row of these strengths (D,) to its owner, and to each incident strong enough by itself."""
+        for incident in incidents:
+            strength = self._strength_in(incident, strengths)
+            if incident is owner or strength > 1.0:
+                incident.last = row.time
+                incident.excess = max(incident.excess, min(strength, row.excess))
+
+    def _strength_in(self, incident: Incident, strengths: Floats) -> float:
+        """Return the pooled strength of a row in the channels of an incident."""
+        return pooled(strengths[incident.known], self._power)
+
+    def _open_by(self, row: AlarmRow, why: str, column: int | None, known: Mask) -> Incident:
         """Open an incident by its first row."""
-        known = known.copy()
         if column is not None:
             known[column] = True
-        return self._add(why, column, row.time, known, excess)
+        return self._add(why, column, row.time, known, row.excess)
 
     def _add(
         self, why: str, column: int | None, time: float, known: Mask, excess: float
@@ -202,16 +235,6 @@ class IncidentBook:
         )
         self._open.append(incident)
         return incident
-
-
-def _spread(incident: Incident, strengths: Floats, known: Mask) -> None:
-    """Add the channels of a row, of these strengths (D,), to an incident that settles."""
-    incident.known |= (strengths > TOUCHED) & ~known
-    others = incident.known.copy()
-    if incident.column is not None:
-        others[incident.column] = False
-    if others.any():
-        incident.spread = max(incident.spread, float(strengths[others].max()))
 
 
 def strengths_of(row: AlarmRow, power: float) -> Floats:
@@ -239,7 +262,7 @@ def power_of(monitor: object) -> float:
 def rows_of_alarm(
     surprise: Numbers,
     shares_of: SharesOf,
-    stream: Numbers,
+    stream: Numbers | None,
     threshold: float,
     dt: float,
     blame_of: Callable[[int], int | None] = lambda row: None,
@@ -249,21 +272,26 @@ def rows_of_alarm(
     Args:
         surprise: (T,).
         shares_of: returns the shares (D,) of the numbers of a row in its surprise, by the index of the row.
-        stream: (T, D) as it was sensed.
+        stream: (T, D) as it was sensed. Without it, numbers whose shares are not finite are missing.
         threshold: of surprise.
         dt: period of the rows [s].
         blame_of: returns the column that blame points to in a row; None where it was not asked.
     """
     over = rows_over(surprise, threshold)
-    for index in np.flatnonzero(over):
+    for index in np.flatnonzero(over).tolist():
+        shares = np.asarray(shares_of(index), np.float64)
+        if stream is None:
+            numbers: Numbers = np.where(np.isfinite(shares), 0.0, np.nan)
+        else:
+            numbers = stream[index]
         yield AlarmRow(
             time=float((index + 1) * dt),
-            numbers=stream[index],
-            shares=np.asarray(shares_of(int(index)), np.float64),
+            numbers=numbers,
+            shares=shares,
             surprise=float(surprise[index]),
             threshold=threshold,
             follows=bool(index and over[index - 1]),
-            column=blame_of(int(index)),
+            column=blame_of(index),
         )
 
 
@@ -286,13 +314,5 @@ def incidents_in(
     if shares_of is None:
         return alarms_in(surprise, threshold, dt)
     book = IncidentBook(power)
-    count = 0
-    over = rows_over(surprise, threshold)
-    for index in np.flatnonzero(over):
-        shares = np.asarray(shares_of(int(index)), np.float64)
-        numbers = np.where(np.isfinite(shares), 0.0, np.nan)
-        time = float((index + 1) * dt)
-        follows = bool(index and over[index - 1])
-        row = AlarmRow(time, numbers, shares, float(surprise[index]), threshold, follows)
-        count += book.follow(row) is not None
-    return count
+    rows = rows_of_alarm(surprise, shares_of, None, threshold, dt)
+    return sum(book.follow(row) is not None for row in rows)
