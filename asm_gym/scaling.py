@@ -276,7 +276,16 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
             commands[n, j] = _standardised(rows[n, i], mean[i], spread[i])
             inputs[n, D + X + L + j] = _zero_if_extreme(commands[n, j])
         expect_events(scale, rows[n], before[n], earlier[n], inputs[n], precision[n])
-    return ScaledRows(senses, seen, commands, inputs, changes, whole, precision, finite)
+    return ScaledRows(
+        senses=senses,
+        seen=seen,
+        commands=commands,
+        inputs=inputs,
+        changes=changes,
+        whole=whole,
+        precision=precision,
+        finite=finite,
+    )
 
 
 @inner

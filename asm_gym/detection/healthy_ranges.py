@@ -22,9 +22,8 @@ Floats = NDArray[np.floating[Any]]
 
 QUANTILES = np.array([0.0, 0.001, 0.01, 0.99, 0.999, 1.0])
 CHANGE = 6  # row of the greatest change
-LEAD = (
-    7  # row of a target's greatest distance; 0 where the number is no target whose sense is known
-)
+# Row of a target's greatest distance; 0 where the number is no target whose sense is known.
+LEAD = 7
 
 
 def healthy_ranges(
@@ -39,17 +38,26 @@ def healthy_ranges(
     """
     rows = np.concatenate(streams)
     changes = np.concatenate([np.abs(np.diff(stream, axis=0)) for stream in streams])
-    lead = np.zeros((1, spec.size))
+    lead = np.zeros(spec.size)
     if meaning is not None and len(meaning.means) == len(spec.motor):
-        is_target = np.array(meaning.means) == TARGET
-        for stream in streams:
-            reached = np.stack([meaning.sensed_target(row) for row in stream[:-1]])
-            distance = np.abs(stream[1:, spec.motor] - reached).max(axis=0)
-            known = np.where(is_target, np.nan_to_num(distance), 0.0)
-            lead[0, spec.motor] = np.maximum(lead[0, spec.motor], known)
+        lead[spec.motor] = _greatest_lead(streams, spec, meaning)
     quantiles = np.nanquantile(rows, QUANTILES, axis=0)
-    greatest_change = np.nanmax(changes, axis=0, keepdims=True)
-    return np.concatenate([quantiles, greatest_change, lead]).astype(np.float32)
+    greatest_change = np.nanmax(changes, axis=0)
+    return np.vstack([quantiles, greatest_change, lead]).astype(np.float32)
+
+
+def _greatest_lead(
+    streams: Sequence[Floats], spec: StreamSpec, meaning: ActionMeaning
+) -> NDArray[np.float64]:
+    """Return the greatest distance (A,) of each commanded target from its sense, a row before."""
+    greatest = np.zeros(len(spec.motor))
+    for stream in streams:
+        sensed = np.stack([meaning.sensed_target(row) for row in stream[:-1]])
+        targets = stream[1:, spec.motor]
+        distance = np.abs(targets - sensed).max(axis=0)
+        greatest = np.maximum(greatest, np.nan_to_num(distance))
+    is_target = np.array(meaning.means) == TARGET
+    return np.where(is_target, greatest, 0.0)
 
 
 def share_beyond(ranges: Floats, column: int, low: float, high: float) -> float:

@@ -244,8 +244,7 @@ class Simulation:
 
     def _bind(self, nominal: NominalViews) -> None:
         """Prepare the arguments of compiled substeps."""
-        self._bound_nominal = nominal
-        self._bound: Bound = bind(
+        parts = (
             self.views,
             nominal,
             self.arms,
@@ -255,6 +254,8 @@ class Simulation:
             self._action,
             self._samples,
         )
+        self._bound_nominal = nominal
+        self._bound: Bound = bind(*parts)
 
     def begin_row(self) -> None:
         """Begin another row of the stream; the contact force goes on to be that of the whole control step."""

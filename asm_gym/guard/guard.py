@@ -108,13 +108,11 @@ class Guard:
         self.table = RobotTable(facts.count, spec, self.fitted.threshold)
 
         motion = None
-        motion_arrays = MotionArrays.empty(facts.count)
         rule = None
         if policies or self._on_alarm in (*REFLEXES, GRADED):
             rule = options.rule(self._graded, facts.dt, rows_per_step)
             if not policies:
                 motion = FeltMotion.of(facts, spec, self._on_alarm)
-                motion_arrays = motion.arrays
         completion = None
         if diagnosis is not None and self._graded:
             completion = diagnosis.completion
@@ -125,24 +123,8 @@ class Guard:
         )
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
-        self._row_judge = RowJudge(
-            facts=facts,
-            table=self.table,
-            validator=self._validator,
-            observer=self._observer,
-            terms=self.terms,
-            motion=motion_arrays,
-            most_impulse=self._arbiter.most_impulse,
-        )
-        self._commander = Commander(
-            facts=facts,
-            table=self.table,
-            motion=motion,
-            policies=policies,
-            arbiter=self._arbiter,
-            warn=self._warn,
-            commands=getattr(monitor, "commands_", None),
-        )
+        self._row_judge = self._new_row_judge(motion)
+        self._commander = self._new_commander(motion, policies, monitor)
         self._limits = EpisodeLimits(
             facts,
             limits_of(options.contact_limits, monitor, facts),
@@ -159,6 +141,35 @@ class Guard:
         self._all_active = True  # the field ``active`` of every record is True
         # What failed when the newest command was chosen, by robot.
         self._command_failures: Mapping[int, str] = NOTHING
+
+    def _new_row_judge(self, motion: FeltMotion | None) -> RowJudge:
+        """Return what judges rows in one compiled call."""
+        arrays = MotionArrays.empty(self._facts.count)
+        if motion is not None:
+            arrays = motion.arrays
+        return RowJudge(
+            facts=self._facts,
+            table=self.table,
+            validator=self._validator,
+            observer=self._observer,
+            terms=self.terms,
+            motion=arrays,
+            most_impulse=self._arbiter.most_impulse,
+        )
+
+    def _new_commander(
+        self, motion: FeltMotion | None, policies: Sequence[Policy], monitor: Monitor
+    ) -> Commander:
+        """Return what chooses the action of each robot."""
+        return Commander(
+            facts=self._facts,
+            table=self.table,
+            motion=motion,
+            policies=policies,
+            arbiter=self._arbiter,
+            warn=self._warn,
+            commands=getattr(monitor, "commands_", None),
+        )
 
     # ------------------------------------------------------------------ what wrappers ask
 

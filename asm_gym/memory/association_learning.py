@@ -19,6 +19,7 @@ precision; Lange et al. 1989 for t_4.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,10 +143,50 @@ def learn_association(
             tick()
         return _learn_from_few(inputs, layout, rng)
 
-    exists = synapses(layout)
     delta = np.ascontiguousarray(inputs[:, layout.changes])
     D = learn_linear(inputs, layout)
     left, remainder = _unexplained(inputs, delta, D)
+    third = thirds(len(inputs), lengths, rng)
+    fresh = _crossfitted(inputs, delta, layout, remainder, third=third, rng=rng, tick=tick)
+    V, U = _learn_hidden(inputs, left, synapses(layout), rng, tick)
+    share = trust(fresh.left, fresh.predicted)
+    U *= share[:, None]
+    f = hidden_units(inputs, V)
+    unexplained = fresh.left - share * fresh.predicted
+    expected_size, normalised = learn_expected_size(unexplained, f, fresh.far, rng, tick)
+    R, Q = inverse_of(inputs, layout)
+    association = Association(
+        V=V,
+        U=U * remainder[:, None],
+        D=D,
+        remainder=remainder,
+        R=R,
+        Q=Q,
+        **expected_size,
+    )
+    return association, normalised
+
+
+class _FreshRows(NamedTuple):
+    """Rows by what was learned without them: errors on rows that were learned are smaller than those to come."""
+
+    left: Array  # (N, X) what the linear part leaves, in spreads of it
+    predicted: Array  # (N, X) what the hidden units predict of it
+    far: Array  # (N, X) leverage
+
+
+def _crossfitted(
+    inputs: Array,
+    delta: Array,
+    layout: ChangeLayout,
+    remainder: Array,
+    *,
+    third: NDArray[np.intp],
+    rng: np.random.Generator,
+    tick: Tick,
+) -> _FreshRows:
+    """Return each row (N, I), and its changes (N, X), by what was learned without its third (N,)."""
+    exists = synapses(layout)
 
     def expect(learned_from: Mask, asked: Mask) -> Array:
         """Return what another linear part leaves, the prediction of that, and leverage (M, 3 X)."""
@@ -159,26 +200,9 @@ def learn_association(
         far = leverage(fresh, R, Q, layout.groups, layout.changes_last)
         return np.hstack([own_left[asked], predicted, far])
 
-    # Errors on rows that were learned are smaller than those to come.
-    fresh = crossfit(expect, thirds(len(inputs), lengths, rng), 3 * len(D))
-    fresh_left, predicted, far = np.split(fresh, 3, axis=1)
-    V, U = _learn_hidden(inputs, left, exists, rng, tick)
-    share = trust(fresh_left, predicted)
-    U *= share[:, None]
-    f = hidden_units(inputs, V)
-    unexplained = fresh_left - share * predicted
-    expected_size, normalised = learn_expected_size(unexplained, f, far, rng, tick)
-    R, Q = inverse_of(inputs, layout)
-    association = Association(
-        V=V,
-        U=U * remainder[:, None],
-        D=D,
-        remainder=remainder,
-        R=R,
-        Q=Q,
-        **expected_size,
-    )
-    return association, normalised
+    fresh = crossfit(expect, third, 3 * delta.shape[1])
+    left, predicted, far = np.split(fresh, 3, axis=1)
+    return _FreshRows(left=left, predicted=predicted, far=far)
 
 
 def _learn_from_few(

@@ -176,7 +176,16 @@ def _of_positions(channel: Channel, ranges: Floats, columns: range) -> Iterator[
         low = max(least - room, min(stop[0], least))
         high = min(most + room, max(stop[1], most))
         near = share_beyond(ranges, column, low + room, high - room)
-        yield Limit(POSITION, label, channel.unit, low, high, least, most, near)
+        yield Limit(
+            kind=POSITION,
+            label=label,
+            unit=channel.unit,
+            low=low,
+            high=high,
+            least=least,
+            most=most,
+            near=near,
+        )
 
 
 def _of_targets(channel: Channel, ranges: Floats, columns: range, margin: float) -> Iterator[Limit]:
@@ -221,4 +230,13 @@ def _symmetric(
     near: float | None = None,
 ) -> Limit:
     least, most = map(float, healthy)
-    return Limit(kind, label, unit, -float(bound), float(bound), least, most, near)
+    return Limit(
+        kind=kind,
+        label=label,
+        unit=unit,
+        low=-float(bound),
+        high=float(bound),
+        least=least,
+        most=most,
+        near=near,
+    )

@@ -215,11 +215,11 @@ def events_of(hours: float) -> list[Event]:
 def changed_day(hours: float, events: Sequence[Event]) -> Day:
     """Return what the events change in the simulation."""
     day = Day.usual(3600.0 * hours)
-    pace, slower, load, home = events[2], events[3], events[4], events[5]
-    day.pace[span_of(pace, CONTROL_PERIOD_S)] = 0.7
-    day.pace[span_of(slower, CONTROL_PERIOD_S)] = 1.3
-    day.load[span_of(load, CONTROL_PERIOD_S)] = 1.3
-    day.home[span_of(home, CONTROL_PERIOD_S)] = 0.2
+    spans = [span_of(event, CONTROL_PERIOD_S) for event in events]
+    day.pace[spans[2]] = 0.7
+    day.pace[spans[3]] = 1.3
+    day.load[spans[4]] = 1.3
+    day.home[spans[5]] = 0.2
     return day
 
 
