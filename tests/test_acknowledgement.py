@@ -308,6 +308,21 @@ def test_a_report_counts_alarms_by_hour_of_the_day_and_names_their_files(memory,
     assert json.loads((tmp_path / "state.json").read_text())["calibrated"] > 0
 
 
+def test_a_report_notes_that_the_rows_around_an_alarm_cannot_be_written(memory, tmp_path, capsys):
+    memory.save(tmp_path / "x.asm")
+    source = log_of(tmp_path, shifted(600))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "incidents").write_text("no folder")
+    command = ["watch", source, "--monitor", str(tmp_path / "x.asm"), "--out", str(out), "--json"]
+    assert main(command) == 1
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (alarm,) = [event for event in events if event["kind"] == "alarm"]
+    assert alarm["evidence"] == ""
+    (note,) = [event["text"] for event in events if event["kind"] == "note"]
+    assert str(out / "incidents") in note
+
+
 def test_alarms_are_counted_by_the_hour_in_which_they_began(memory):
     stream = shifted(600)
     (trace,) = traces_of([Log("log", Episode.from_stream(stream, SPEC))], memory)
