@@ -470,6 +470,23 @@ def test_a_new_column_is_a_heading_and_a_function():
         Table("t", ("a", "b"), [("x",)])
 
 
+@pytest.mark.parametrize("width", [60, 80, 120, 250])
+def test_no_word_of_a_table_breaks_and_columns_left_out_are_named(width):
+    headings = ("policy", *(f"heading{n} of a column" for n in range(12)))
+    row = ("a scripted expert", *(f"number{n} [N]" for n in range(12)))
+    console = Console(width=width, color_system=None)
+    with console.capture() as printed:
+        console.print(Table("t", headings, [row]))
+    lines = printed.get().splitlines()
+    assert max(map(len, lines)) <= width
+    words = printed.get().replace(",", " ").replace(".", " ").split()
+    shown = [f"number{n}" in words for n in range(12)]
+    assert all(f"heading{n}" in words for n in range(12))
+    assert shown == sorted(shown, reverse=True)
+    assert shown[0]
+    assert all(shown) == (width == 250)
+
+
 def test_a_terminal_shows_a_row_in_a_line():
     headings = ("guard", "harm of hostile policies avoided", "healthy [episodes]")
     console = Console(width=120, color_system=None)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
 from rich.table import Table as RichTable
 
@@ -13,6 +16,8 @@ from asm_gym.evaluation.statistics import Share
 
 Subject = TypeVar("Subject")
 FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
+FEWEST_SHOWN = 2  # columns, however narrow a terminal is
+COLUMN_BORDER = 3  # characters beside the text of each column
 
 
 @dataclass(frozen=True)
@@ -31,15 +36,44 @@ class Table:
                     f"{list(row)}"
                 )
 
-    def __rich__(self) -> RichTable:
-        """Return the table for a terminal; rich calls this."""
-        shown = RichTable(title=escape(self.caption))
-        for heading in self.headings:
-            shown.add_column(escape(heading), justify="right", overflow="fold")
-        shown.columns[0].justify = "left"
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the table for a terminal, without the last columns where words would break; rich calls this."""
+        widths = self._widths(options.max_width - 1)
+        table = RichTable(title=escape(self.caption))
+        for heading, width in zip(self.headings, widths, strict=False):
+            table.add_column(escape(heading), width=width, justify="right", overflow="fold")
+        table.columns[0].justify = "left"
         for row in self.rows:
-            shown.add_row(*(escape(str(cell)) for cell in row))
-        return shown
+            table.add_row(*(escape(str(cell)) for cell in row[: len(widths)]))
+        yield table
+        left_out = self.headings[len(widths) :]
+        if left_out:
+            yield f"A wider terminal also shows: {escape(', '.join(left_out))}."
+
+    def _widths(self, available: int) -> list[int]:
+        """Return the widths of the columns that fit, so that each has room for its longest word."""
+        columns = [list(map(str, cells)) for cells in zip(self.headings, *self.rows, strict=True)]
+        widths = [max(map(_longest_word, cells)) for cells in columns]
+        while len(widths) > FEWEST_SHOWN and _table_width(widths) > available:
+            widths.pop()
+        lines = [max(map(cell_len, cells)) for cells in columns[: len(widths)]]
+        for _ in range(available - _table_width(widths)):
+            wraps = [
+                (math.ceil(line / width), -line) for line, width in zip(lines, widths, strict=True)
+            ]
+            most = wraps.index(max(wraps))  # of those with most lines, what takes least to mend
+            if wraps[most][0] <= 1:
+                break
+            widths[most] += 1
+        return widths
+
+
+def _longest_word(text: str) -> int:
+    return max(map(cell_len, text.split()), default=1)
+
+
+def _table_width(widths: Sequence[int]) -> int:
+    return sum(width + COLUMN_BORDER for width in widths)
 
 
 def tabulate(
