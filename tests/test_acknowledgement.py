@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import queue
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
 from asm_gym.detection.adaptive import AdaptiveThreshold
 from asm_gym.detection.following_threshold import FollowingThreshold
-from asm_gym.evaluation.recorded_alarms import alarms_of, by_hour, traces_of
+from asm_gym.evaluation.incident_window import IncidentWindow
+from asm_gym.evaluation.recorded_alarms import HEADINGS, alarms_of, by_hour, traces_of
 from asm_gym.guard.live_events import LiveEvent
 from asm_gym.guard.live_watch import follow
 from asm_gym.guard.operator_orders import ACKNOWLEDGE, SNOOZE, Order, order_in, without_orders
@@ -330,3 +332,50 @@ def test_alarms_are_counted_by_the_hour_in_which_they_began(memory):
     table = by_hour(alarms_of(trace), hours=0.5)
     assert [(row[0], row[2]) for row in table.rows] == [("23", "1")]
     assert "2 an hour" in table.caption
+
+
+def test_a_report_shows_the_channel_of_an_alarm_beside_what_was_expected_in_the_second_around_it(
+    memory, tmp_path, capsys
+):
+    needs("matplotlib")
+    memory.save(tmp_path / "x.asm")
+    command = ["watch", log_of(tmp_path, shifted(600)), "--monitor", str(tmp_path / "x.asm")]
+    assert main([*command, "--out", str(tmp_path)]) == 1
+    report = (tmp_path / "report.html").read_text(encoding="utf-8")
+    (caption,) = re.findall(r"cards.*?<figcaption>(.*?)</figcaption>", report, re.DOTALL)
+    (said,) = re.findall(r"sum read (\S+) rad; from the other senses (\S+) ± (\S+) rad", caption)
+    sensed, expected, plus_minus = map(float, said)
+    assert sensed - expected == pytest.approx(SHIFT, abs=0.15)
+    assert 0 < plus_minus < 0.1
+    with (tmp_path / "alarms.csv").open(encoding="utf-8", newline="") as file:
+        (alarm,) = csv.DictReader(file)
+    assert float(alarm["sensed"]) == pytest.approx(sensed, abs=1e-3)
+
+    window = IncidentWindow(
+        times=[SPEC.dt * k for k in range(100)],
+        rows=shifted(600)[250:350],
+        surprise=[0.0] * 100,
+        labels=SPEC.labels,
+        column=2,
+    )
+    moment = window.moment(SPEC.dt * 50, Expectation(memory))
+    assert (moment.times[0], moment.times[-1]) == pytest.approx((-0.5, 0.5))
+    deviation = moment.sensed - moment.expected
+    np.testing.assert_allclose(deviation, SHIFT * (moment.times > -SPEC.dt / 2), atol=0.15)
+
+
+def test_a_reader_sees_a_capped_surprise_and_a_file_holds_the_number(memory):
+    far = shifted(600)
+    far[SHIFTED:, 2] += 50.0
+    sharp = memory.with_threshold(memory.threshold / 4)
+    (trace,) = traces_of([Log("log", Episode.from_stream(far, SPEC))], sharp)
+    alarm = max(alarms_of(trace), key=lambda each: each.excess)
+    assert alarm.excess > 1000
+    column = HEADINGS.index("thresholds")
+    assert float(alarm.cells()[column]) == pytest.approx(alarm.excess, abs=0.01)
+    assert alarm.cells(to_read=True)[column] == "> 1000"
+    assert "(> 1000 thresholds)" in alarm.in_words()
+    events = [event for event in watched(sharp, far) if event.kind == "alarm"]
+    live = max(events, key=lambda event: event.thresholds)
+    assert live.thresholds > 1000
+    assert "> 1000 thresholds" in live.text

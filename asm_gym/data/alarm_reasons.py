@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,15 @@ MISSING_DATA = "missing data"
 NOT_FINITE = "not finite"
 LATE = "late"
 
+MOST_SHOWN = 1000.0  # thresholds, above which a number tells a reader nothing more
 TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
+
+
+def thresholds_shown(excess: float) -> str:
+    """Return surprise in thresholds as a reader sees it; ``inf`` for missing numbers."""
+    if MOST_SHOWN < excess < math.inf:
+        return f"> {MOST_SHOWN:.0f}"
+    return f"{excess:.2f}"
 
 
 def reason(row: Row) -> str:

@@ -24,6 +24,7 @@ from asm_gym.data.column_behaviour import is_constant
 from asm_gym.data.inspection import Inspection
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.table_layout import is_numeric
+from asm_gym.evaluation.incident_window import AlarmMoment
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.statistics import Floats
 from asm_gym.files import written_whole
@@ -196,6 +197,25 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
             Patch(color=VERMILLION, alpha=0.2, label="alarm"),
         ]
         fig.legend(handles=handles, loc="outside right upper", ncols=2)
+    return fig
+
+
+def alarm_figure(moment: AlarmMoment, channel: str) -> Figure:
+    """Draw the channel of an alarm in the second around it, sensed beside expected; small enough for a telephone."""
+    with figure(height=2.1, width=4.2) as fig:
+        ax = fig.subplots()
+        ax.axvline(0.0, color=VERMILLION, linewidth=1.5, label="alarm")
+        finite = np.where(np.isfinite(moment.sensed), moment.sensed, np.nan)
+        ax.plot(moment.times, finite, color=BLUE, label="sensed")
+        if np.isfinite(moment.expected).any():
+            low = moment.expected - moment.plus_minus
+            high = moment.expected + moment.plus_minus
+            ax.fill_between(moment.times, low, high, color=GREEN, alpha=0.25, linewidth=0)
+            ax.plot(moment.times, moment.expected, color=GREEN, linestyle=DASHED, label="expected")
+        ax.set(xlabel="time from the alarm [s]", ylabel=moment.unit)
+        ax.set_title(channel)
+        ax.grid(axis="y")
+        fig.legend(loc="outside lower center", ncols=3)
     return fig
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import SURPRISING, blamed
+from asm_gym.data.alarm_reasons import SURPRISING, blamed, thresholds_shown
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.episode import Episode
@@ -20,7 +20,7 @@ from asm_gym.data.schema import LOG_ORIGIN, LogSchema
 from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.detection.incidents import Incident, IncidentBook, power_of, rows_of_alarm
-from asm_gym.evaluation.incident_window import AFTER_S, BEFORE_S, IncidentWindow
+from asm_gym.evaluation.incident_window import AFTER_S, BEFORE_S, AlarmMoment, IncidentWindow
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import named_causes
@@ -61,6 +61,7 @@ class Alarm(NamedTuple):
     evidence: str = ""  # file of the rows around it
     cause: str = ""  # in words; empty where none was looked for
     remedy: str = ""  # what to do about it
+    moment: AlarmMoment | None = None  # the channel around its first row
 
     @property
     def stamp(self) -> float | None:
@@ -76,15 +77,31 @@ class Alarm(NamedTuple):
             return date_of(self.start)
         return ""
 
-    def cells(self) -> tuple[str, ...]:
-        """Format for a table, under ``HEADINGS``."""
+    def in_words(self) -> str:
+        """Return what happened, in a sentence or two."""
+        where = f"{self.log}, {self.start:.3f} s: "
+        text = f"{self.channel or 'the whole row'}: {self.why}"
+        if self.why == SURPRISING:
+            text = f"{self.channel} is not what the other numbers let expect"
+            if self.beside is not None:
+                text = self.beside.sentence(self.channel)
+            text += f" ({thresholds_shown(self.excess)} thresholds)"
+        if self.cause:
+            text += f". Cause: {self.cause}; {self.remedy}"
+        return f"{where}{text}."
+
+    def cells(self, to_read: bool = False) -> tuple[str, ...]:
+        """Format for a table, under ``HEADINGS``; ``to_read`` caps the surprise."""
+        excess = f"{self.excess:.2f}"
+        if to_read:
+            excess = thresholds_shown(self.excess)
         times = (f"{self.start:.3f}", f"{self.end:.3f}")
         beside = ("", "", "", "")
         if self.beside is not None:
             sensed, expected, plus_minus, unit = self.beside
             beside = (f"{sensed:.5g}", f"{expected:.5g}", f"{plus_minus:.2g}", unit)
         return (
-            *(self.log, *times, self.channel, self.why, f"{self.excess:.2f}", self.date),
+            *(self.log, *times, self.channel, self.why, excess, self.date),
             *(*beside, self.evidence, self.cause, self.remedy),
         )
 

@@ -31,7 +31,8 @@ from asm_gym.files import write_text, written_whole
 COPIED = ("task", "monitor", "kind", "severity", "seed", "onset")
 """Columns of ``results.parquet`` that are fields of a scored episode."""
 
-_LINKED = re.compile(r"<td>(incidents/[0-9]+\.csv)</td>")  # files beside a report
+_LINKED = re.compile(r"^(incidents/[0-9]+\.csv)$")  # files beside a report
+_LINK = r'<a href="\1">\1</a>'
 
 _PAGE = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
 
@@ -44,6 +45,7 @@ def write_report(
     drawn: Mapping[str, Figure],
     details: Mapping[str, object] | None = None,
     opening: Mapping[str, Figure] | None = None,
+    cards: Mapping[str, Figure] | None = None,
 ) -> Path:
     """Write an HTML file, which appears when it is complete.
 
@@ -52,16 +54,18 @@ def write_report(
         drawn: figures by caption.
         details: how to make the report again: arguments, seed, versions.
         opening: figures by caption that stand before the tables.
+        cards: small figures by caption, one for each alarm.
     """
     path = Path(path)
     parts = [f"<p>{escape(p)}</p>" for p in intro.split("\n\n") if p.strip()]
     if opening:
         parts += [_figure(caption, figure) for caption, figure in opening.items()]
+    if cards:
+        parts.append(_figures("Alarms, the largest first", "cards", cards))
     if tables:
         parts.append("<section><h2>Results</h2>\n" + "\n".join(map(_table, tables)) + "</section>")
     if drawn:
-        shown = "\n".join(_figure(caption, figure) for caption, figure in drawn.items())
-        parts.append(f'<section><h2>Figures</h2>\n<div class="figures">{shown}</div></section>')
+        parts.append(_figures("Figures", "figures", drawn))
     if details:
         items = "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>"
@@ -72,15 +76,25 @@ def write_report(
     return path
 
 
+def _figures(heading: str, kind: str, drawn: Mapping[str, Figure]) -> str:
+    """Return a section of figures by caption; ``kind`` is their class in the page's style."""
+    shown = "\n".join(_figure(caption, figure) for caption, figure in drawn.items())
+    return f'<section><h2>{heading}</h2>\n<div class="{kind}">{shown}</div></section>'
+
+
 def _table(table: Table) -> str:
-    frame = pd.DataFrame(table.rows, columns=table.headings, dtype=str)
-    frame = (
-        frame.set_index(table.headings[0]).rename_axis(None).rename_axis(columns=table.headings[0])
-    )
-    with pd.option_context("display.max_colwidth", None):
-        html = _LINKED.sub(r'<td><a href="\1">\1</a></td>', frame.to_html(border=0))
-    start, rest = html.split("\n", 1)
-    return f'<div class="scroll">{start}<caption>{escape(table.caption)}</caption>\n{rest}</div>'
+    """Return a table; on a narrow screen each cell stands in a line of its own, behind its heading."""
+    headings = [escape(heading) for heading in table.headings]
+    lines = ["".join(f"<th>{heading}</th>" for heading in headings)]
+    for row in table.rows:
+        name, *cells = (_LINKED.sub(_LINK, escape(str(cell))) for cell in row)
+        named = zip(headings[1:], cells, strict=True)
+        values = "".join(f'<td data-name="{heading}">{cell}</td>' for heading, cell in named)
+        lines.append(f"<th>{name}</th>{values}")
+    head, *body = (f"<tr>{line}</tr>\n" for line in lines)
+    caption = f"<caption>{escape(table.caption)}</caption>"
+    content = f"<thead>{head}</thead>\n<tbody>{''.join(body)}</tbody>"
+    return f'<div class="scroll"><table>{caption}\n{content}</table></div>'
 
 
 def _figure(caption: str, figure: Figure) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import LATE, SURPRISING, blamed
+from asm_gym.data.alarm_reasons import LATE, SURPRISING, blamed, thresholds_shown
 from asm_gym.data.bridging import Bridge
 from asm_gym.data.live_rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
@@ -298,7 +298,8 @@ class LiveWatch(Adapter):
     def _alarm_surprise(self, incident: Incident, numbers: NDArray[np.float64]) -> None:
         """Raise the alarm of an incident that a row opens."""
         latency_ms = self._latencies[-1]
-        text = f"{incident.excess:.2f} thresholds  {latency_ms:.2f} ms after the row came"
+        excess = thresholds_shown(incident.excess)
+        text = f"{excess} thresholds  {latency_ms:.2f} ms after the row came"
         if incident.reason != SURPRISING:
             text += f"  ({incident.reason})"
         details = self._desk.details(incident, numbers, self.alarms + 1)

@@ -47,6 +47,12 @@ class Expected(NamedTuple):
         """Return it for a table."""
         return f"{self.sensed:.4g}, expected {self.expected:.4g} ± {self.plus_minus:.2g} {self.unit}".rstrip()
 
+    def sentence(self, channel: str) -> str:
+        """Return what the channel read and what was expected, as a sentence without a full stop."""
+        read = f"{channel} read {self.sensed:.4g} {self.unit}".rstrip()
+        expected = f"{self.expected:.4g} ± {self.plus_minus:.2g} {self.unit}".rstrip()
+        return f"{read}; from the other senses {expected} was expected"
+
 
 @dataclass(frozen=True)
 class LevelShift:
@@ -96,8 +102,15 @@ class Expectation:
             sensed=float(rows[-1, column]),
             expected=float(values[-1]),
             plus_minus=error,
-            unit=self._spec.units[column],
+            unit=self.unit(column),
         )
+
+    def unit(self, column: int) -> str:
+        """Return the unit of a column; empty without one."""
+        unit = self._spec.units[column]
+        if unit == "1":
+            return ""
+        return unit
 
     def level_shift(self, rows: Numbers, column: int | None, date: str = "") -> LevelShift:
         """Return the level shift of a column in the last rows (T, D).

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from asm_gym.data.alarm_reasons import SURPRISING
+from asm_gym.data.alarm_reasons import SURPRISING, thresholds_shown
 from asm_gym.data.bridging import bridged
 from asm_gym.data.logs import Log
 from asm_gym.data.reader_notes import note
@@ -61,9 +61,9 @@ class Review:
             for alarm in recorded_alarms.alarms_of(trace, expectation):
                 window = recorded_alarms.window_of(trace, alarm)
                 path = folder / f"{len(self.alarms) + 1:04d}.csv"
-                self.alarms.append(
-                    alarm._replace(evidence=self._written(path, window, expectation))
-                )
+                evidence = self._written(path, window, expectation)
+                moment = window.moment(alarm.start, expectation)
+                self.alarms.append(alarm._replace(evidence=evidence, moment=moment))
             self.hours += len(trace) * trace.dt / 3600
             self.excused.update(recorded_alarms.excused_in(trace))
             if self.wear is not None and not trace.alarm.any():
@@ -82,6 +82,11 @@ class Review:
         if self.wear is not None and self.wear.worn:
             parts.append(str(self.wear.worn[0]))
         return ", ".join(parts)
+
+    def largest(self) -> list[Alarm]:
+        """Return the largest alarms, ``MOST_PRINTED`` at most, missing data last."""
+        ordered = sorted(self.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
+        return ordered[:MOST_PRINTED]
 
     def _written(self, path: Path, window: IncidentWindow, expectation: Expectation) -> str:
         """Write the rows around an alarm; return the file as the report names it, empty if it cannot be written."""
@@ -107,7 +112,7 @@ def event_of(alarm: Alarm) -> LiveEvent:
     return LiveEvent(
         kind=ALARM,
         time=alarm.start,
-        text=f"{alarm.excess:.2f} thresholds up to {alarm.end:.3f} s",
+        text=f"{thresholds_shown(alarm.excess)} thresholds up to {alarm.end:.3f} s",
         reason=alarm.why,
         channel=alarm.channel,
         thresholds=alarm.excess,
@@ -140,16 +145,15 @@ def say_table(
             f"Bridged {reviewed.bridged_rows} rows that lack a number, in gaps of at most "
             f"{bridge:.3g} s: they are not judged."
         )
-    alarms = sorted(reviewed.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
-    printed = alarms[:MOST_PRINTED]
+    printed = reviewed.largest()
     summary = reviewed.summary()
-    if len(printed) < len(alarms):
+    if len(printed) < len(reviewed.alarms):
         summary += f"; the {MOST_PRINTED} largest:"
     say(summary)
     if not printed:
         return
     width = max(len(alarm.channel) for alarm in printed)
-    lines_of_cells = [HEADINGS, *(alarm.cells() for alarm in printed)]
+    lines_of_cells = [HEADINGS, *(alarm.cells(to_read=True) for alarm in printed)]
     for cells in lines_of_cells:
         log, start, end, channel, why, excess, _ = cells[:PRINTED]
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")

@@ -164,14 +164,20 @@ def write_figures_and_report(args: Args, reviewed: Review) -> str:
     figures.save(stream, args.out / "stream.png")
     tables = [recorded_alarms.by_hour(reviewed.alarms, reviewed.hours)]
     if reviewed.alarms:
-        rows = [alarm.cells() for alarm in reviewed.alarms]
+        rows = [alarm.cells(to_read=True) for alarm in reviewed.alarms]
         tables.append(Table("Alarms", HEADINGS, rows))
+    cards = {
+        alarm.in_words(): figures.alarm_figure(alarm.moment, alarm.channel)
+        for alarm in reviewed.largest()
+        if alarm.moment is not None
+    }
     report = args.out / "report.html"
     write_report(
         report,
         title=f"asm-gym watch: {args.source}",
         intro=f"{reviewed.summary()}, as {args.monitor} sees them.",
         tables=tables,
+        cards=cards,
         drawn={
             "Surprise over time, the most surprising episode first": surprise,
             "What its most surprising channels sensed": stream,
