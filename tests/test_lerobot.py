@@ -43,16 +43,17 @@ class Arm:
         return dict(zip(MOTORS, (wave * min(1, k / 30)).tolist(), strict=True))
 
 
-def recorded(seed: int, rows: int = 260) -> Episode:
+def recorded(seed: int, rows: int = 260, arm: type[Arm] = Arm) -> Episode:
     """A healthy run, with a pause, for a hold is one too."""
-    arm, columns = Arm(seed), list[list[float]]()
+    robot, columns = arm(seed), list[list[float]]()
     pause = int(np.random.default_rng(seed).integers(60, 180))
     for k in range(rows):
         going = k if k < pause else max(pause, k - 60)
-        observation, action = arm.get_observation(), arm.policy(going)
+        observation, action = robot.get_observation(), robot.policy(going)
         columns.append([*observation.values(), *action.values()])
-        arm.send_action(action)
-    names = [f"{what}[{m}]" for what in ("observation.state", "action") for m in MOTORS]
+        robot.send_action(action)
+    names = [f"observation.state[{name}]" for name in observation]
+    names += [f"action[{name}]" for name in action]
     made = dict(zip(names, np.array(columns).T, strict=True))
     return Episode.from_table(made, rate=RATE, action=["action*"], success=True)
 
@@ -308,3 +309,55 @@ def test_lerobots_own_pipeline_takes_it(monitor):
     assert others[0] == alarms[0]
     pipeline.reset()
     assert not guard.intervened
+
+
+class CurrentArm(Arm):
+    """Servos that say their currents: they rise with the distance to the target."""
+
+    def get_observation(self) -> dict[str, float]:
+        told = self.sent[-1] if self.sent else self.q
+        currents = 0.1 + 0.02 * np.abs(told - self.q) + 0.005 * self.rng.random(6)
+        names = [motor.replace(".pos", ".current") for motor in MOTORS]
+        return super().get_observation() | dict(zip(names, currents.tolist(), strict=True))
+
+
+@pytest.fixture(scope="module")
+def deaf():
+    """A monitor of an arm that says its currents, and that no surprise wakes."""
+    episodes = [recorded(n, arm=CurrentArm) for n in range(12)]
+    made = make_monitor("kalman", episodes[0].spec).fit(episodes[:6])
+    return made.calibrate(episodes[6:], 0.2).with_threshold(1e12)
+
+
+@pytest.mark.parametrize("servo", [2, 5])  # the elbow, and the gripper, whose grip a hold keeps
+def test_a_stalled_servo_with_a_high_current_is_an_alarm_by_itself_and_is_unloaded(deaf, servo):
+    guard, arm = LeRobotGuard(deaf), CurrentArm(201)
+    for k in range(160):
+        arm.jammed[servo] = k >= 100
+        observation = arm.get_observation()
+        arm.send_action(guard({"observation": observation, "action": arm.policy(k)})["action"])
+        if guard.alarm:
+            break
+    assert 100 < k < 140
+    motor = MOTORS[servo]
+    alarm = guard.last_alarm
+    assert (alarm["reason"], alarm["response"], alarm["fault"]) == ("stall", "unload", "stalled")
+    assert motor == f"{alarm['servo']}.pos"
+    assert arm.sent[-1][servo] == pytest.approx(observation[motor])  # it stands there
+    for _ in range(10):
+        observation = arm.get_observation()
+        arm.send_action(guard({"observation": observation, "action": arm.policy(k)})["action"])
+        assert guard.intervened
+        assert abs(arm.sent[-1][servo] - arm.q[servo]) < 0.5
+    assert observation[motor.replace(".pos", ".current")] < 0.15
+
+
+def test_a_high_current_of_an_arm_that_moves_and_a_still_arm_are_no_stall(deaf):
+    guard, arm = LeRobotGuard(deaf), CurrentArm(202)
+    for k in range(120):
+        observation = arm.get_observation()
+        if k < 60:
+            observation["elbow_flex.current"] = 9.0
+        action = arm.policy(min(k, 60))
+        arm.send_action(guard({"observation": observation, "action": action})["action"])
+        assert not guard.alarm, guard.last_alarm

@@ -41,6 +41,7 @@ from asm_gym.monitors.blame import FollowedBlame
 from asm_gym.validation import check_choice, check_number
 from asm_gym.wrappers.lerobot_arm import (
     COMMANDED,
+    SENSED,
     LoopStep,
     column_of,
     meaning_of,
@@ -49,12 +50,14 @@ from asm_gym.wrappers.lerobot_arm import (
     row_of,
     servo_of,
 )
-from asm_gym.wrappers.servo_diagnosis import ServoHistory
+from asm_gym.wrappers.servo_diagnosis import CURRENT, STALLED, ServoHistory, stall_currents
 
 _log = logging.getLogger("asm_gym.lerobot")
 
 # Stay where the arm stood until surprise is low; stay until ``reset``; only report.
 ON_ALARM = ("hold", "stop", "monitor")
+STALL = "stall"  # reason of an alarm
+UNLOAD = "unload"  # response to it
 
 
 class LeRobotGuard(Adapter):
@@ -73,8 +76,10 @@ class LeRobotGuard(Adapter):
 
     Attributes:
         alarm, intervened: whether the newest row raised an alarm, and whether a hold was sent.
-        last_alarm: surprise in thresholds, reason, channel, servo and fault of the servo
-            ("overheated", "stalled" or empty) of the newest alarm; empty before the first.
+        last_alarm: surprise in thresholds, reason, channel, servo, fault of the servo
+            ("overheated", "stalled" or empty) and response of the newest alarm; empty before the
+            first. Where a servo has stalled, the reason is "stall" and the response "unload": its
+            target becomes where it stands, so that its current falls.
 
     Example:
         >>> guard = LeRobotGuard("so101.asm")  # doctest: +SKIP
@@ -116,8 +121,9 @@ class LeRobotGuard(Adapter):
         """Begin a new episode, and end a stop."""
         self._guard: Guard | None = None  # made once the names of the actions are known
         self._sent: dict[str, float] = {}  # the newest finite number that was sent, by name
+        self._unloaded: dict[str, float] = {}  # targets of servos that stalled in this hold
         self._pace = Pace(self._spec.dt)
-        self._history = ServoHistory(self._spec.dt)
+        self._history = ServoHistory(self._spec.dt, stall_currents(self.monitor, self._columns))
         self._blame = FollowedBlame(self.monitor)
         self.alarm = False
         self.intervened = False
@@ -190,6 +196,13 @@ class LeRobotGuard(Adapter):
         """Return the row of a step, and tell the watchdog of it."""
         row = row_of(given, self._columns)
         failure = self._beyond_range(row[0], given)
+        stalled = self._history.overloaded(given.observation)
+        if stalled:
+            position = f"{stalled}.pos"
+            sensed = number_of(given.observation, position)
+            if np.isfinite(sensed):
+                self._unloaded[position] = sensed
+            failure = f"{STALL}: {stalled} does not move and takes more current than ever learned"
         if self._watchdog is not None and not self._watchdog.beat():
             failure = "watchdog: it has died"
         return SensedRows(row, failures={0: failure} if failure else {})
@@ -295,7 +308,10 @@ class LeRobotGuard(Adapter):
     def _chosen(self, guard: Guard, action: Mapping[str, Any]) -> dict[str, float]:
         """Return the action that the guard chooses, the policy's or a hold; some may be NaN."""
         executed = guard.act(self._numbers(action), lambda _: None).actions[0]
-        return dict(zip(self._names, executed.tolist(), strict=True))
+        chosen = dict(zip(self._names, executed.tolist(), strict=True))
+        if not guard.overriding[0]:
+            self._unloaded.clear()
+        return chosen | self._unloaded
 
     def _numbers(self, action: Mapping[str, Any]) -> Floats32:
         """Return (1, A) the numbers of an action; NaN where one is missing."""
@@ -306,23 +322,35 @@ class LeRobotGuard(Adapter):
     ) -> dict[str, Any]:
         """Return what there is to say of an alarm in a row (D,), by the shares (D,) of its numbers."""
         robot = report.robots[0]
+        failure = report.failures.get(0, "")
         cause = reason(row)
-        if report.failures:
+        if failure:
             cause = FAILURE
-        if robot["out_of_range"] or report.failures.get(0, "").startswith("range"):
+        if robot["out_of_range"] or failure.startswith("range"):
             cause = OUT_OF_RANGE
+        response = self.on_alarm
         channel = ""
         motor = ""
         column = blamed(row, shares)
         if column is not None:
             channel = self._spec.labels[column]
             motor = self._columns[column].motor
+        servo = servo_of(motor)
+        fault = self._history.fault_of(motor, step.observation)
+        if failure.startswith(STALL):
+            cause = STALL
+            servo = self._history.overloaded(step.observation)
+            fault = STALLED
+            channel = f"{SENSED}[{servo}{CURRENT}]"
+        if cause == STALL and response != "monitor":
+            response = UNLOAD
         return {
             "surprise": float(robot["surprise"] / robot["threshold"]),
             "reason": cause,
             "channel": channel,
-            "servo": servo_of(motor),
-            "fault": self._history.fault_of(motor, step.observation),
+            "servo": servo,
+            "fault": fault,
+            "response": response,
         }
 
     def get_config(self) -> dict[str, Any]:
