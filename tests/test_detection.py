@@ -31,7 +31,6 @@ from asm_gym.detection.evidence import (
     whitening,
     worst_case,
 )
-from asm_gym.detection.glitches import SpikeRule, Waiting
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
@@ -82,9 +81,7 @@ def test_the_evidence_of_a_whole_episode_is_that_of_its_rows(steps):
         evidence = accumulate(evidence, e[None], c[None], gains)
         vectors.append(evidence.vector[0])
         running.append(evidence.context[0])
-    together = accumulated(
-        whitened, contexts, gains, SpikeRule.unused(4), Waiting.start(1, errors=4)
-    )
+    together = accumulated(whitened, contexts, gains)
     for found, wanted in zip(together, (vectors, running), strict=True):
         np.testing.assert_array_equal(found, wanted)
 

@@ -28,7 +28,6 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.memory_skills import name_skills, recall
 from asm_gym.monitors.monitor_state import MonitorState
-from tests.spikes import followed, held_back
 from tests.streams import sine_episodes, sine_spec
 
 
@@ -82,12 +81,10 @@ def observed_by(asm, state, rows):
     errors, memory = expected_by(asm, state.model, rows)
     d, senses, (was, before) = asm.detection.detector_, asm.spec.sensory, state.detection
     white = bounded(errors, d.bound) @ d.whitening
-    limited, late, waiting = held_back(d.spikes, was.waiting, white)
     evidence = Evidence(
-        vector=followed(was, limited, late, d.gains),
+        vector=was.vector + d.gains[:, None] * (white[:, None] - was.vector),
         context=was.context + CONTEXT_GAIN * (memory.expected - was.context),
         steps=was.steps + 1,
-        waiting=waiting,
     )
     ratios = (strength(evidence, d.gains) / d.ceiling) ** d.tail
     _, parts = pool(ratios.reshape(len(rows), -1))
@@ -125,7 +122,6 @@ def memory(dt=0.05, **settings):
     """A fitted memory, and rows (T, B, D) with which much is wrong."""
     spec = replace(sine_spec(), dt=dt)
     episodes = sine_episodes(12, spec=spec, steps=(60, 60))
-    settings = {"glitches": True} | settings
     asm = NeuralASM(spec, hidden_size=16, association_size=30, epochs=1, **settings).fit(
         episodes[:8]
     )

@@ -4,8 +4,7 @@
     benign event     surprise <= threshold < raw          an excuse alone keeps the row from being an alarm
     alarms counted   one that persists, or returns within a minute, is one
 
-``raw`` is the surprise before a benign event excuses a part of it (``benign_events``), or before a spike is held back
-(``glitches``). The functions of single numbers
+``raw`` is the surprise before a benign event excuses a part of it (``benign_events``). The functions of single numbers
 serve compiled code, and NumPy arrays the functions of arrays.
 """
 
@@ -22,14 +21,12 @@ Values = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 
 NO_EVENT = ""
-GLITCH = "glitch"
 KNOCK = "knock"
 STOP = "stop"
 FAULT = "fault"
-EVENTS = (NO_EVENT, GLITCH, KNOCK, STOP, FAULT)
+EVENTS = (NO_EVENT, KNOCK, STOP, FAULT)
 """Kinds of rows; the last is the worst. Rows keep an index in it."""
-BENIGN_EVENTS = (KNOCK, STOP, GLITCH)  # that keep surprise from being an alarm
-GLITCH_EVENT = EVENTS.index(GLITCH)
+BENIGN_EVENTS = (KNOCK, STOP)  # that keep surprise from being an alarm
 KNOCK_EVENT = EVENTS.index(KNOCK)
 STOP_EVENT = EVENTS.index(STOP)
 FAULT_EVENT = EVENTS.index(FAULT)
@@ -45,10 +42,7 @@ JUDGED = np.dtype(
     ],
     align=True,
 )
-"""A row as it was judged; ``excuse`` is an index in ``EVENTS``.
-
-``raw_surprise / divisor`` is ``surprise``, but in a glitch, where it is what the spike alone would make of it.
-"""
+"""A row as it was judged: ``raw_surprise / divisor`` is ``surprise``; ``excuse`` is an index in ``EVENTS``."""
 
 
 @compiled

@@ -30,7 +30,6 @@ from asm_gym.detection.evidence import (
     Evidence,
     accumulated,
     add_evidence,
-    add_released,
     average,
     bounded,
     pool,
@@ -39,9 +38,7 @@ from asm_gym.detection.evidence import (
     whitening,
     worst_case,
 )
-from asm_gym.detection.glitches import SpikeRule, Waiting, hold_back, usual_errors
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
-from asm_gym.spec import StreamSpec
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 100.0
@@ -68,7 +65,6 @@ class Detector(NamedTuple):
     context_quantile: Floats
     """(2 C + 1,) weights of log ŝ on the context and its running mean, and a bias."""
     context_range: Floats  # (2,) limits of log ŝ
-    spikes: SpikeRule  # what waits for a second row
     gains: Floats  # (G,) a, each in (0, 1]
     bound: float  # ν > 0
 
@@ -86,19 +82,9 @@ class Detector(NamedTuple):
             tail=ones,
             context_quantile=np.zeros(2 * learned[0].contexts.shape[1] + 1),
             context_range=np.zeros(2),
-            spikes=SpikeRule.unused(len(matrix)),
             gains=np.asarray(gains, np.float64),
             bound=bound,
         )
-
-    def with_spikes(self, runs: Sequence[ModelOutput], spec: StreamSpec) -> Detector:
-        """Return the detector that lets spikes wait, by the errors of nominal episodes."""
-        usual = usual_errors([self.whitened(run) for run in runs])
-        return self._replace(spikes=SpikeRule.of(usual, spec))
-
-    def whitened(self, run: ModelOutput) -> Floats:
-        """Return the whitened errors (T, X) of a whole episode."""
-        return bounded(run.errors, self.bound) @ self.whitening
 
     def with_worst_case(
         self,
@@ -172,18 +158,16 @@ class Detector(NamedTuple):
         contexts = np.asarray(output.contexts, np.float64)
         after = self.start(len(errors))
         shares = np.empty(errors.shape)
-        spikes = np.empty(len(errors))
-        step_evidence(self, evidence, after, ModelOutput(errors, contexts), shares, spikes)
+        step_evidence(self, evidence, after, ModelOutput(errors, contexts), shares)
         return after, shares
 
     def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:
         """Return v (T, G, X), and the running mean of the contexts (T, C), of a whole episode."""
+        whitened = bounded(run.errors, self.bound) @ self.whitening
         contexts = np.asarray(run.contexts, np.float64)
-        waiting = Waiting.start(1, len(self.whitening))
-        whitened = self.whitened(run)
-        vectors, running = accumulated(whitened, contexts, self.gains, self.spikes, waiting)
+        vectors, running = accumulated(whitened, contexts, self.gains)
         rows = np.arange(1, len(vectors) + 1)
-        episode = Evidence(vector=vectors, context=running, steps=rows, waiting=waiting)
+        episode = Evidence(vector=vectors, context=running, steps=rows)
         return strength(episode, self.gains), running
 
 
@@ -194,7 +178,6 @@ NO_DETECTOR = Detector(
     tail=_NO_ERRORS,
     context_quantile=np.zeros(1),
     context_range=np.zeros(2),
-    spikes=SpikeRule.unused(0),
     gains=np.zeros(0),
     bound=BOUND,
 )
@@ -203,49 +186,23 @@ NO_DETECTOR = Detector(
 
 @compiled
 def step_evidence(
-    detector: Detector,
-    before: Evidence,
-    after: Evidence,
-    output: ModelOutput,
-    shares: Any,
-    spikes: Any,
+    detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any
 ) -> None:
-    """Write the new evidence, and each error's share (B, X) of the value.
-
-    ``spikes`` (B,) are written: the value of rows whose spike waits, if it did not; 0 for the others.
-    """
+    """Write the new evidence, and each error's share (B, X) of the value."""
     limited = bounded(output.errors, detector.bound)
     whitened = np.dot(limited, detector.whitening)
     ratios = np.empty(detector.ceiling.shape)
     for n in range(len(shares)):
         share = shares[n]
-        vector = after.vector[n]
-        steps = before.steps[n] + 1
-        after.steps[n] = steps
-        is_spike, age = hold_back(detector.spikes, before.waiting, after.waiting, n, whitened[n])
-        add_evidence(detector.gains, before.vector[n], vector, whitened[n])
-        if age > 0:
-            add_released(detector.gains, vector, before.waiting.rest[n], age)
-        greatest = write_ratios(detector, vector, steps, ratios)
+        after.steps[n] = before.steps[n] + 1
+        add_evidence(detector.gains, before.vector[n], after.vector[n], whitened[n])
+        greatest = write_ratios(detector, after.vector[n], after.steps[n], ratios)
         powers = write_shares(ratios, greatest, share)
 
         usual = usual_level(detector, before.context[n], after.context[n], output.contexts[n])
         value = powers ** (1.0 / POWER) * np.exp(greatest) / np.exp(usual)
         value_of_a_power = value / max(powers, TINY)
         scale(share, value_of_a_power)
-        spikes[n] = 0.0
-        if is_spike:
-            spikes[n] = value_with_spike(detector, after, n, ratios) / np.exp(usual)
-
-
-@inner
-def value_with_spike(detector: Detector, after: Evidence, n: int, ratios: Any) -> float:
-    """Return the pooled ratios of stream n, had its spike not been held back; ``ratios`` (G, X) is written to."""
-    vector = after.vector[n].copy()
-    add_released(detector.gains, vector, after.waiting.rest[n], 0)
-    greatest = write_ratios(detector, vector, after.steps[n], ratios)
-    powers = write_shares(ratios, greatest, np.empty(ratios.shape[1]))
-    return powers ** (1.0 / POWER) * np.exp(greatest)
 
 
 @inner

@@ -2,8 +2,7 @@
 
     whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
     bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
-    evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0                 for each of several gains a; spikes wait, see
-                                                                        ``glitches``
+    evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0                 for each of several gains a
                v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
     ratios     r_i = (v_i/q_i)^κ_i                                      q_i: v_i stays below it in 90 % of episodes
     pooled     s_t = (Σ_i r_i^p)^(1/p)
@@ -25,7 +24,6 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.base import Array, Floats
-from asm_gym.detection.glitches import SpikeRule, Waiting, hold_back
 from asm_gym.memory.linear_association import check_inputs, gram
 
 POWER = 8  # p
@@ -75,7 +73,6 @@ class Evidence(NamedTuple):
     vector: Floats  # (B, G, X) w_t, for each of G gains
     context: Floats  # (B, C) running mean of the contexts
     steps: NDArray[np.int64]  # (B,) t, rows so far
-    waiting: Waiting  # spikes that are no evidence yet
 
     @classmethod
     def start(
@@ -90,7 +87,6 @@ class Evidence(NamedTuple):
             vector=np.zeros((batch, gains, errors)),
             context=np.zeros((batch, context)),
             steps=np.zeros(batch, np.int64),
-            waiting=Waiting.start(batch, errors),
         )
 
 
@@ -134,40 +130,19 @@ def add_evidence(
         average(before[g], after[g], whitened, gains[g])
 
 
-@inner
-def add_released(
-    gains: Any,
-    vector: Any,
-    rest: Any,
-    age: int,
-) -> None:
-    """Add to w_t (G, X) what was held back (X,) so many rows ago: a (1 - a)^age d."""
-    for g in range(len(gains)):
-        left = gains[g] * (1.0 - gains[g]) ** age
-        for i in range(len(rest)):
-            vector[g, i] += left * rest[i]
-
-
 @compiled
 def accumulated(
-    whitened: Array, contexts: Array, gains: Array, rule: SpikeRule, waiting: Waiting
+    whitened: Array,
+    contexts: Array,
+    gains: Array,
 ) -> tuple[Floats, Floats]:
-    """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C).
-
-    ``waiting`` is the state of one stream before the first row, and is written to.
-    """
+    """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
     rows, errors = whitened.shape
     vectors = np.zeros((rows, len(gains), errors))
     running = np.zeros(contexts.shape)
-    after = Waiting(np.zeros((1, errors)), np.zeros(1, np.int64), np.zeros(1, np.int64))
     for t in range(rows):
         before = max(t - 1, 0)  # in the first row all is still 0
-        row = whitened[t].copy()
-        _, age = hold_back(rule, waiting, after, 0, row)
-        add_evidence(gains, vectors[before], vectors[t], row)
-        if age > 0:
-            add_released(gains, vectors[t], waiting.rest[0], age)
-        waiting, after = after, waiting
+        add_evidence(gains, vectors[before], vectors[t], whitened[t])
         average(running[before], running[t], contexts[t], CONTEXT_GAIN)
     return vectors, running
 

@@ -24,7 +24,6 @@ from asm_gym.detection.evidence import (
     Evidence,
     ceilings,
 )
-from asm_gym.detection.glitches import SpikeRule, Waiting
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     RARER,
@@ -37,8 +36,6 @@ from asm_gym.detection.repetition import (
 from asm_gym.scaling import carried_columns
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
-
-USUAL_ERRORS = "usual_errors"  # c of ``glitches``
 
 
 class EvidenceState(NamedTuple):
@@ -58,8 +55,6 @@ class EvidenceDetection:
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
         habituates: whether surprise is relative to what is usual in a context; a memory for any policy does without.
         tail_index: ξ_0 in (0, 1]: a ratio falls off as probability to this power. The smaller, the more senses add up.
-        glitches: whether a spike of one group in one row waits for a second row (``glitches``). A memory that was
-            learned without goes on without.
 
     Attributes:
         detector_: turns errors into surprise; None before ``fit``.
@@ -76,7 +71,6 @@ class EvidenceDetection:
         "context_range",
         "repetition",
     )
-    optional_arrays: tuple[str, ...] = (USUAL_ERRORS,)
 
     @typed
     def __init__(
@@ -87,7 +81,6 @@ class EvidenceDetection:
         shrinkage: float = 1e-3,
         habituates: bool = True,
         tail_index: float = TAIL_INDEX,
-        glitches: bool = False,
     ) -> None:
         self.spec = spec
         self.gains = tuple(check_number("each of gains", a, above=0.0, high=1.0) for a in gains)
@@ -97,7 +90,6 @@ class EvidenceDetection:
         self.shrinkage = check_number("shrinkage", shrinkage, low=0.0, high=1.0)
         self.habituates = check_flag("habituates", habituates)
         self.tail_index = check_number("tail_index", tail_index, above=0.0, high=1.0)
-        self.glitches = check_flag("glitches", glitches)
         self.learned_: Arrays = {}
         self.detector_: Detector | None = None
         self.repetition_: RepetitionWeights | None = None
@@ -107,8 +99,6 @@ class EvidenceDetection:
         learned = nominal.outputs(nominal.learned)
         everything = [*learned, *nominal.outputs(nominal.held_out)]
         detector = Detector.white(learned, self.gains, self.bound, self.shrinkage)
-        if self.glitches:
-            detector = detector.with_spikes(everything, self.spec)
         detector = detector.with_worst_case(everything, self.tail_index)
         if self.habituates:
             detector = detector.habituated(everything, rng)
@@ -117,8 +107,6 @@ class EvidenceDetection:
         streams = [episode.stream[:, senses] for episode in nominal.episodes]
         arrays = {name: getattr(detector, name) for name in self.arrays[:-1]}
         arrays["repetition"] = count_repetitions(streams, self.spec.noise[senses] > 0)
-        if np.isfinite(detector.spikes.usual).all():  # spikes wait
-            arrays[USUAL_ERRORS] = detector.spikes.usual
         return self.restore(arrays)
 
     def with_ceilings(self, maxima: Array, is_first: bool) -> EvidenceDetection:
@@ -136,7 +124,6 @@ class EvidenceDetection:
     def restore(self, learned: Arrays) -> Self:
         """Take over what another has learned. Raises ValueError where it does not fit."""
         detector = self._detector_of(learned)
-        self.glitches = USUAL_ERRORS in learned
         repetition = self._repetition_of(learned["repetition"])
         self.learned_ = learned
         self.detector_ = detector
@@ -154,14 +141,7 @@ class EvidenceDetection:
             if not ((array > 0.0) & (array <= most)).all():
                 raise ValueError(f"the {name} of evidence must be in (0, {most:g}]")
 
-        spikes = SpikeRule.unused(errors)
-        if USUAL_ERRORS in learned:
-            usual = np.array(learned[USUAL_ERRORS], np.float64)
-            check_shapes({USUAL_ERRORS: usual}, {USUAL_ERRORS: (errors,)})
-            if not (usual > 0.0).all():
-                raise ValueError(f"the {USUAL_ERRORS} of evidence must be above 0")
-            spikes = SpikeRule.of(usual, self.spec)
-        detector = Detector(**arrays, spikes=spikes, gains=np.array(self.gains), bound=self.bound)
+        detector = Detector(**arrays, gains=np.array(self.gains), bound=self.bound)
         if not detector.reach > 1.0:  # what is seldom exceeded in nominal episodes
             raise ValueError(
                 f"no error can add up to evidence: at most {detector.reach:g} of what is usual"
@@ -229,9 +209,6 @@ class EvidenceDetection:
         """Return the state without its evidence; its number of rows and its context are kept."""
         evidence, repetition = state
         return EvidenceState(
-            evidence=evidence._replace(
-                vector=np.zeros_like(evidence.vector),
-                waiting=Waiting.start(len(evidence.steps), evidence.vector.shape[-1]),
-            ),
+            evidence=evidence._replace(vector=np.zeros_like(evidence.vector)),
             repetition=repetition._replace(unlikely=np.zeros_like(repetition.unlikely)),
         )

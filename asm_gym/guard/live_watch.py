@@ -324,7 +324,7 @@ class LiveWatch(Adapter):
         return self.rows * self._spec.dt
 
     def _report_event(self, event: str) -> None:
-        """Note a knock, a stop or a glitch when it begins."""
+        """Note a knock or a stop when it begins."""
         if event in BENIGN_EVENTS and event != self._last_event:
             self._note(f"{event}: no alarm")
         self._last_event = event

@@ -82,7 +82,7 @@ class AsmInfo(TypedDict, total=False):
     alarms: int  # steps in alarm so far in this episode
     reason: str  # the alarm term of the least priority; empty without an alarm
     terms: tuple[str, ...]  # all alarm terms that hold
-    event: str  # "fault", "knock", "stop", "glitch" (no alarm), or empty
+    event: str  # "fault", "knock", "stop" (no alarm), or empty
     state: str  # who acts next
     intervened: bool  # another than the policy acted, in some row
     gave_up: bool  # the episode ends

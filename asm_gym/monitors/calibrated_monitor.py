@@ -16,7 +16,6 @@ from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_comparison import refuse_other_scales
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
-from asm_gym.detection.alarm_rule import GLITCH
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
@@ -69,7 +68,6 @@ class CalibratedMonitor:
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
         blocks_: surprise in blocks of time, for promises by the hour (``detection.conformal``).
-        glitch_blocks_: what spikes that were held back would have made of them; None where none are.
         promised_: ``"episode"`` or ``"hour"``, the unit of the promise.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty if the stream has no such channels.
@@ -85,7 +83,6 @@ class CalibratedMonitor:
     threshold_: float | None
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
-    glitch_blocks_: Blocks | None
     healthy_: tuple[float, ...]
     pace_: dict[str, NDArray[np.float32]]
     motion_: NDArray[np.floating[Any]] | None
@@ -315,10 +312,6 @@ class CalibratedMonitor:
         self.promised_ = rate.per
         self.maxima_ = np.array([value.max() for value in values])
         self.blocks_ = blocks
-        events = [surprise.excused_by_event for surprise in surprises]
-        if all(GLITCH in event for event in events):
-            spikes = [event[GLITCH] for event in events]
-            self.glitch_blocks_ = Blocks.of(spikes, self.spec.dt)
 
     def _keep_healthy_ranges(self, episodes: Sequence[Episode]) -> None:
         """Keep the forces, speeds, motion and commands of healthy episodes."""
@@ -367,16 +360,6 @@ class CalibratedMonitor:
         if self.promised_ == HOUR:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
-
-    @property
-    def glitch_promise(self) -> Promise:
-        """The rate of glitches in nominal operation by the hour, which are no alarms (``detection.glitches``).
-
-        Raises NotFitted before ``calibrate``, and where spikes are not held back.
-        """
-        if self.maxima_ is None or self.glitch_blocks_ is None:
-            raise self._lacking("promise of glitches")
-        return hourly_promise(self.glitch_blocks_, self.threshold, len(self.maxima_))
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
         """Return a copy that weighs several judgements against each other by nominal episodes; itself with just one."""
@@ -465,9 +448,7 @@ class CalibratedMonitor:
         arrays_of_model = dict(arrays)
         for detection in self.detections.values():
             if arrays.keys() >= set(detection.arrays):
-                optional = getattr(detection, "optional_arrays", ())
-                own_names = [name for name in (*detection.arrays, *optional) if name in arrays]
-                own_arrays = {name: arrays_of_model.pop(name) for name in own_names}
+                own_arrays = {name: arrays_of_model.pop(name) for name in detection.arrays}
                 detection.restore(own_arrays)
         self.model.restore(arrays_of_model, skills)
         self._place_errors()
@@ -478,7 +459,6 @@ class CalibratedMonitor:
         self.threshold_ = None
         self.maxima_ = None
         self.blocks_ = None
-        self.glitch_blocks_ = None
         self.promised_ = EPISODE
         self.healthy_ = ()
         self.pace_ = {}

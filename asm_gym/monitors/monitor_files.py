@@ -19,7 +19,6 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
 BLOCKS = "nominal_blocks"
-GLITCH_BLOCKS = "glitch_blocks"
 MAXIMA = "nominal_maxima"
 PACE_PREFIX = "pace "  # begins the names of the speeds of hands in each task
 
@@ -62,10 +61,9 @@ def read_monitor(saved: Checkpoint) -> SavedMonitor:
     check_choice("promise", header["promised"], (EPISODE, HOUR))
     calibration: dict[str, Any] = {"promised_": header["promised"]}
     calibration["maxima_"] = arrays.pop(MAXIMA, None)
-    for attribute, name in (("blocks_", BLOCKS), ("glitch_blocks_", GLITCH_BLOCKS)):
-        calibration[attribute] = None
-        if name in arrays:
-            calibration[attribute] = Blocks.restored(arrays.pop(name))
+    calibration["blocks_"] = None
+    if BLOCKS in arrays:
+        calibration["blocks_"] = Blocks.restored(arrays.pop(BLOCKS))
 
     healthy = [check_number("healthy", value, low=0.0) for value in header["healthy"]]
     tasks = [name for name in arrays if name.startswith(PACE_PREFIX)]
@@ -100,9 +98,8 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
             arrays[name] = np.asarray(array, np.float64)
     if monitor.maxima_ is not None:
         arrays[MAXIMA] = monitor.maxima_
-    for name, blocks in ((BLOCKS, monitor.blocks_), (GLITCH_BLOCKS, monitor.glitch_blocks_)):
-        if blocks is not None:
-            arrays[name] = blocks.array
+    if monitor.blocks_ is not None:
+        arrays[BLOCKS] = monitor.blocks_.array
     for attribute, name in OPTIONAL.items():
         if getattr(monitor, attribute) is not None:
             arrays[name] = getattr(monitor, attribute)

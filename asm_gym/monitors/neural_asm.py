@@ -71,8 +71,6 @@ class NeuralASM(CalibratedMonitor):
             on every row. ``"traces"``, with fixed decays, is that of memories from earlier versions.
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
-        glitches: let a spike of one group of senses in one row wait for a second row (``detection.glitches``). A memory
-            of an earlier release, learned without, goes on without.
         values: judge values, such as torques, beside changes (``monitors.torque``), if other senses predict them: for
             lasting pushes. None judges them where torques, currents or efforts are among the senses
             (``torque.arm_features.judged_by_values``).
@@ -112,7 +110,6 @@ class NeuralASM(CalibratedMonitor):
         habituates: bool = True,
         dynamics: str = RECURRENT,
         excuses: bool = False,
-        glitches: bool = False,
         values: bool | None = None,
         urdf: str = "",
         seed: int = 0,
@@ -144,9 +141,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         evidence_params = {name: getattr(config, name) for name in OF_EVIDENCE}
-        evidence = EvidenceDetection(
-            spec, habituates=habituates, glitches=glitches, **evidence_params
-        )
+        evidence = EvidenceDetection(spec, habituates=habituates, **evidence_params)
         self.config = self.config.as_checked_by(evidence)
         self.habituates = evidence.habituates
         super().__init__(model, evidence, seed=seed)
@@ -181,13 +176,6 @@ class NeuralASM(CalibratedMonitor):
             ValueError: an unknown name; the message lists the known ones.
         """
         return cls.load(pretrained_file(name))
-
-    @property
-    def glitches(self) -> bool:
-        """Whether a spike in one row waits for a second one."""
-        evidence = self.detections[EvidenceDetection.name]
-        assert isinstance(evidence, EvidenceDetection)
-        return evidence.glitches
 
     @property
     def senses_(self) -> StreamScaler:

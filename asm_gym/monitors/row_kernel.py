@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 
 from asm_gym.blas import one_thread_for
 from asm_gym.compilation import Bound, bind, compiled, inner, must_compile
-from asm_gym.detection.alarm_rule import GLITCH_EVENT, JUDGED
+from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.detection.base import ModelOutput
 from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState, find_events
 from asm_gym.detection.detector import NO_DETECTOR, step_evidence
 from asm_gym.detection.evidence import Evidence, scale, total
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
-from asm_gym.detection.glitches import Waiting
 from asm_gym.detection.repetition import (
     NO_REPETITION,
     Repetition,
@@ -49,7 +48,7 @@ KINDS_OF_WEIGHTS: dict[Any, Any] = {
     RecurrentWeights: recurrent_shapes,
 }
 """The records of weights that a temporal network may have, and their shapes."""
-STATE_ARRAYS = 17  # of ``arrays_of``
+STATE_ARRAYS = 14  # of ``arrays_of``
 
 
 class RowWeights(NamedTuple):
@@ -115,7 +114,7 @@ class RowKernel:
         self._arguments = (memory, detection, events)
         self._memory = memory
         self._detector = detection.fitted_detector
-        self._has_events = events is not None or detection.glitches
+        self._has_events = events is not None
         senses = NO_SENSES
         if events is not None:
             senses = events.senses
@@ -184,8 +183,7 @@ def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
         memory.expected,
         memory.skill,
         *memory.history,
-        *detection.evidence[:-1],
-        *detection.evidence.waiting,
+        *detection.evidence,
         *detection.repetition,
         *state.excuses,
     ]
@@ -196,13 +194,12 @@ def state_of(arrays: Any) -> MonitorState:
     """Return the state of ``STATE_ARRAYS`` arrays, in the order of ``arrays_of``."""
     traces, expected, skill = arrays[:3]
     history = RowHistory(arrays[3], arrays[4], arrays[5])
-    waiting = Waiting(arrays[9], arrays[10], arrays[11])
-    evidence = Evidence(arrays[6], arrays[7], arrays[8], waiting)
-    repetition = Repetition(arrays[12], arrays[13], arrays[14])
+    evidence = Evidence(arrays[6], arrays[7], arrays[8])
+    repetition = Repetition(arrays[9], arrays[10], arrays[11])
     return MonitorState(
         model=MemoryState(traces, expected, history, skill),
         detection=EvidenceState(evidence, repetition),
-        excuses=EventState(arrays[15], arrays[16]),
+        excuses=EventState(arrays[12], arrays[13]),
         values=(),
     )
 
@@ -250,15 +247,12 @@ def observe_rows(bound: Bound, rows: Any, judged: Any, attribution: Any) -> Any:
 
     if detector.whitening.size:
         shares = np.empty(errors.shape)
-        spikes = np.empty(len(rows))
         output = ModelOutput(errors, after.model.expected)
-        evidence = before.detection.evidence
-        step_evidence(detector, evidence, after.detection.evidence, output, shares, spikes)
+        step_evidence(detector, before.detection.evidence, after.detection.evidence, output, shares)
         step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
         find_events(senses, before.excuses, after.excuses, rows, judged)
         unlikely = after.detection.repetition.unlikely
         surprise_of_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
-        note_glitches(spikes, judged)
     return errors
 
 
@@ -401,15 +395,6 @@ def surprise_of_rows(
             judged[n].surprise /= judged[n].divisor
             for i in range(len(share)):
                 share[i] /= judged[n].divisor
-
-
-@inner
-def note_glitches(spikes: Any, judged: Any) -> None:
-    """Write what rows (B,) would be, had a spike not been held back, where nothing else excuses them."""
-    for n in range(len(judged)):
-        if spikes[n] > judged[n].raw_surprise and judged[n].excuse == 0:
-            judged[n].raw_surprise = spikes[n]
-            judged[n].excuse = GLITCH_EVENT
 
 
 @inner

@@ -402,9 +402,6 @@ def summary_of_threshold(args: Args, monitor: Any, calibration_episodes: int) ->
     if expected > 1.0:
         line += f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
     yield line
-    if monitor.glitch_blocks_ is not None:
-        glitches = monitor.glitch_promise
-        yield f"Glitches, which are no alarms: {glitches.rate:.3g}, at most {glitches.at_most:.3g}."
 
 
 main = partial(run, "fit", Args, fit)

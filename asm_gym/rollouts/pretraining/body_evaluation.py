@@ -13,7 +13,7 @@ import numpy as np
 from asm_gym.data.crashes import CRASH, peak_force
 from asm_gym.data.episode import Episode
 from asm_gym.detection import AdaptiveThreshold
-from asm_gym.detection.alarm_rule import GLITCH, KNOCK, STOP
+from asm_gym.detection.alarm_rule import KNOCK, STOP
 from asm_gym.evaluation.comparison import detectability_of, visible_kinds
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.detection_tables import kept_rate, milliseconds
@@ -191,7 +191,6 @@ COLUMNS: dict[str, Callable[[Scores], str]] = {
     "faults/h": lambda scores: hourly_alarms(scores.solved).text,
     "knocks/h": _excused_per_hour(KNOCK),
     "stops/h": _excused_per_hour(STOP),
-    "glitches/h": _excused_per_hour(GLITCH),
     "failed, alarm": _failed_with_alarm,
     "AUROC": _where_faulty(lambda metrics: f"{metrics.auroc:.3f}"),
     "found": _where_faulty(_found),
@@ -251,9 +250,7 @@ def promises_table(scores: Sequence[Scores], thresholds: Mapping[float, float]) 
         alarms = kept_rate(hourly_alarms(solved), promised)
         knocks = hourly_alarms(solved, KNOCK).value
         stops = hourly_alarms(solved, STOP).value
-        glitches = hourly_alarms(solved, GLITCH).value
-        row = [f"{promised:g}", f"{threshold:.3g}", alarms]
-        row += [f"{knocks:.1f}", f"{stops:.1f}", f"{glitches:.1f}"]
+        row = [f"{promised:g}", f"{threshold:.3g}", alarms, f"{knocks:.1f}", f"{stops:.1f}"]
         for names in severities.values():
             of_severity = [trace for trace in faults if trace.severity in names]
             row.append(_found(DetectionMetrics("", of_severity, [], WINDOW_S)))
@@ -264,8 +261,7 @@ def promises_table(scores: Sequence[Scores], thresholds: Mapping[float, float]) 
         "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the "
         f"promise. Found: faults that an ideal observer could see, within {WINDOW_S:g} s."
     )
-    events = ("knocks", "stops", "glitches")
-    headings = ("promised", "threshold", "false alarms", *events, *severities)
+    headings = ("promised", "threshold", "false alarms", "knocks", "stops", *severities)
     return Table(caption, headings, rows)
 
 
@@ -275,10 +271,8 @@ def summary(scores: Sequence[Scores]) -> str:
     fault = hourly_alarms(healthy)
     knock = hourly_alarms(healthy, KNOCK)
     stop = hourly_alarms(healthy, STOP)
-    glitch = hourly_alarms(healthy, GLITCH)
     found = Share.total([each.metrics.detected for each in scores])
     return (
-        f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops, "
-        f"{glitch.text} glitches an hour in "
+        f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops an hour in "
         f"{fault.hours:.2f} healthy hours, {count(found)} faults found."
     )
