@@ -27,7 +27,13 @@ from asm_gym.envs.object_tracker import (
     rotation_vector,
     write_sense,
 )
-from asm_gym.envs.simulated_tracker import QUALITY, TrackedHand
+from asm_gym.envs.simulated_tracker import (
+    LONGEST_HIDDEN_S,
+    LONGEST_UNSEEN_S,
+    QUALITY,
+    TrackedHand,
+    TrackerQuality,
+)
 from asm_gym.exceptions import SpecMismatch
 from asm_gym.spec import CARRIED_CHANNEL, HANDLED, MOTOR
 from asm_gym.stream_view import StreamView
@@ -172,8 +178,8 @@ class Scene:
         self.model = SimpleNamespace(body=lambda name: SimpleNamespace(id=0))
         self.proprioception = SimpleNamespace(last=np.zeros((1, 64)))
 
-    def tracked(self, noise=1.0):
-        hand = TrackedHand(self, 0, range(1, len(self.data.xpos)), noise, QUALITY)
+    def tracked(self, noise=1.0, quality=QUALITY):
+        hand = TrackedHand(self, 0, range(1, len(self.data.xpos)), noise, quality)
         hand.begin_episode(np.random.default_rng(1))
         return hand
 
@@ -230,6 +236,40 @@ def test_an_object_that_is_gone_is_missing_for_longer_than_a_dropout():
     assert np.isnan(rows[10:]).all()
 
 
+def hidden_and_lifted(longest_hidden):
+    """Return the senses of an object that the hand hides and lifts, and how long it has been unseen in each row [s].
+
+    The filter believes that the object rests, so that its estimate stays behind.
+    """
+    scene = Scene([0.05, 0.0, 0.0])
+    quality = TrackerQuality(
+        dropout=0.0, hiding=1.0, shown_again=0.0, longest_hidden=longest_hidden
+    )
+    hand = scene.tracked(quality=quality)
+    rows, unseen = [], []
+    for t in range(30):
+        rows.append(hand.read(DT))
+        unseen.append(hand.track.unseen_s)
+        if 3 <= t < 11:
+            scene.data.site_xpos[0, 2] += 0.02
+            scene.data.xpos[1, 2] += 0.02
+    return np.array(rows), np.array(unseen)
+
+
+def test_an_object_that_is_lifted_while_the_hand_hides_it_is_not_lost():
+    rows, unseen = hidden_and_lifted(QUALITY.longest_hidden)
+    assert unseen.max() > LONGEST_UNSEEN_S + DT
+    assert np.isfinite(rows).all()
+
+
+def test_an_object_that_was_near_the_hand_is_lost_after_the_longest_time_that_it_may_be_hidden():
+    rows, unseen = hidden_and_lifted(longest_hidden=100)
+    is_lost = unseen > LONGEST_HIDDEN_S + 1e-9
+    assert is_lost.any()
+    np.testing.assert_array_equal(np.isnan(rows).all(axis=1), is_lost)
+    np.testing.assert_array_equal(np.isnan(rows).any(axis=1), is_lost)
+
+
 def test_without_objects_the_sense_says_so():
     rows = np.array([Scene().tracked().read(DT) for _ in range(3)])
     np.testing.assert_array_equal(rows[:, -1], NO_POSE)
@@ -262,8 +302,8 @@ def played(stream, steps=12, seed=3):
 def test_the_group_changes_no_observation_and_no_other_channel_and_episodes_repeat():
     from asm_gym.envs.sensors import GROUPS
 
-    without, narrow = played(GROUPS)
-    with_group, wide = played((*GROUPS, HANDLED))
+    without, narrow = played([group for group in GROUPS if group != HANDLED])
+    with_group, wide = played(GROUPS)
     (observed, rows), (again, rows_again) = with_group
     np.testing.assert_array_equal(observed, without[0][0])
     np.testing.assert_array_equal(observed, again)

@@ -4,7 +4,8 @@
     p ← p + α (z - p),  u ← u + β/T (z - p)       z: a measured pose, every T; in the same way for the orientation
 
 u is the velocity beyond that of the carrier. β = 2 (2 - α) - 4 √(1 - α) damps the filter critically; α = 0.15 at 20 Hz
-lets 0.6 Hz through, and of 5 mm leaves 2.4 mm and 8 mm/s. A pose that is missing is predicted.
+lets motion of up to 0.7 Hz through (-3 dB), velocities of up to 0.4 Hz, and of 5 mm leaves 1.7 mm and 2.3 mm/s. A pose
+that is missing is predicted.
 
 Only where fingers move at the object does its carrier become undecided. It is decided once the hand has gone 5 cm since
 they stopped: the object is carried if it has gone more than 0.35 of that way.

@@ -93,7 +93,8 @@ class RobosuiteEnv(SteppedEnv):
         horizon: control steps before truncation; the task's own where None.
         reward_shaping: dense reward where True, for success alone where False.
         terminate_on_success: end the episode (``terminated``) when the task is solved.
-        stream: channel groups of ``joint torque hand wrench gripper action contact object``; empty for no stream.
+        stream: channel groups of ``joint torque hand wrench gripper handled action contact object``; the first seven by
+            default, empty for no stream.
         stream_freq: rows of the stream a second [Hz], a multiple of ``control_freq`` that divides 500; None for one row
             a control step.
         sensor_noise: scales the noise of every channel; 0 for exact readings, in steps of no resolution.

@@ -3,7 +3,8 @@
     pose      5 mm and 1°, 20 times a second
     dropout   2 % of all poses; near the hand it hides the object now and then, for 3 poses in the mean, at most 8
     object    the nearest to the fingers of those within 1.5 m; another one once it has been nearer by 2 cm for 0.15 s
-    missing   a pose that is missing for longer than that explains makes all numbers NaN
+    missing   a pose that is missing for longer than that explains makes all numbers NaN: for 0.75 s where the object
+              was near the hand when it was last seen, else for 0.3 s
 
 Draws come from a generator of its own, so that no other sensor reads anything else by it.
 """
