@@ -3,7 +3,7 @@
     p ← p + (v_c + u) dt        the object goes with its carrier: the hand if it is carried, else the world
     p ← p + α (z - p),  u ← u + β/T (z - p)       z: a measured pose, every T; in the same way for the orientation
 
-u is the velocity beyond that of the carrier. β = 2 (2 - α) - 4 √(1 - α) damps the filter critically; α = 0.3 at 20 Hz
+u is the velocity beyond that of the carrier. β = 2 (2 - α) - 4 √(1 - α) damps the filter critically; α = 0.15 at 20 Hz
 lets 0.6 Hz through, and of 5 mm leaves 2.4 mm and 8 mm/s. A pose that is missing is predicted.
 
 Only where fingers move at the object does its carrier become undecided. It is decided once the hand has gone 5 cm since
@@ -21,7 +21,7 @@ import numpy as np
 from asm_gym.compilation import compiled, inner
 from asm_gym.envs.mujoco_views import Floats, records
 
-ALPHA = 0.3  # share of a measured deviation that the filter takes over
+ALPHA = 0.15  # share of a measured deviation that the filter takes over
 BETA = 2 * (2 - ALPHA) - 4 * np.sqrt(1 - ALPHA)
 
 # What the last number of the sense says of the object.

@@ -27,11 +27,10 @@ if TYPE_CHECKING:
     from asm_gym.envs.simulated_tracker import HandledObjects
 
 Corruption = Callable[[NDArray[np.float64]], None]  # a sensor fault: edits a measured row in place
-GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
+GROUPS = ("joint", "torque", "hand", "wrench", "gripper", HANDLED, MOTOR)
 """The channel groups of a stream by default, in the order of a row."""
 
-# groups that no real robot measures about itself, and what a tracker of objects measures
-EXTRA_GROUPS = ("contact", "object", HANDLED)
+EXTRA_GROUPS = ("contact", "object")  # what no real robot measures
 
 
 class _Sensor(NamedTuple):

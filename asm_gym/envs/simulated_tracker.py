@@ -258,8 +258,8 @@ class TrackedHand:
 
 def _channels(prefix: str, quality: TrackerQuality) -> list[Channel]:
     """Return the channels of one hand, with the noise that the filter leaves."""
-    left = 0.5  # of the noise of poses, by the filter's gains
-    rate_left = 1.5  # [1/s]
+    left = 0.34  # of the noise of poses, by the filter's gains
+    rate_left = 0.46  # [1/s]
     axes = ("x", "y", "z")
     return [
         Channel(
