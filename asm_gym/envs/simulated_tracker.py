@@ -54,7 +54,8 @@ QUALITY = TrackerQuality()
 # Of the hand's position, velocity and angular velocity, as its own sensors have it.
 HAND_NOISE = np.array([3e-4] * 3 + [3e-3] * 3 + [1e-2] * 3 + [0.0])
 NEAR_HAND = 0.12  # the hand may hide an object so near to it [m]
-LONGEST_HIDDEN_S = 0.75  # a pose of an object near the hand is missing for at most so long [s]
+NEAR_ESTIMATE = NEAR_HAND + 0.03  # where the filter believes an object that may be so near [m]
+LONGEST_HIDDEN_S = 0.75  # a pose of an object that was near the hand is missing for at most so long [s]
 LONGEST_UNSEEN_S = 0.3  # and of another [s]
 GIVEN_UP_S = 2.0  # after so long another object is tracked [s]
 VIEW = 1.5  # farthest that an object may be from the hand to be seen [m]
@@ -145,6 +146,7 @@ class TrackedHand:
         self._nearer_s = 0.0
         self._hidden = 0  # poses for which the hand hides the object
         self._shown = 0  # poses measured since it did
+        self._was_near = False  # the object was near the hand since its last pose
         self._pose_due_s = 0.0
         clear(self.track)
         self._look_at_hand()
@@ -212,6 +214,7 @@ class TrackedHand:
         self.target = body
         self._nearer_s = 0.0
         self._hidden = 0
+        self._was_near = False
         clear(self.track)
 
     def _measure(self) -> None:
@@ -229,6 +232,7 @@ class TrackedHand:
         if not is_seen:
             return
         self._shown += 1
+        self._was_near = False
         orientation = self._data.xmat[self.target].reshape(3, 3)
         turned = rotation(turn_error) @ orientation
         correct(self.track, position + position_error, turned, quality.period)
@@ -250,8 +254,10 @@ class TrackedHand:
         if self.target < 0:
             return False
         offset = self.track.position - self._hand.position
+        if self.track.poses and np.linalg.norm(offset) < NEAR_ESTIMATE:
+            self._was_near = True
         longest = LONGEST_UNSEEN_S
-        if self.track.poses and np.linalg.norm(offset) < NEAR_HAND:
+        if self._was_near:
             longest = LONGEST_HIDDEN_S
         return bool(self.track.unseen_s > longest + 1e-9)
 
