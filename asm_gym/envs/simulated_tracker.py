@@ -257,7 +257,7 @@ class TrackedHand:
         if self.track.poses and np.linalg.norm(offset) < NEAR_ESTIMATE:
             self._was_near = True
         longest = LONGEST_UNSEEN_S
-        if self._was_near:
+        if self._was_near or not self.track.poses:
             longest = LONGEST_HIDDEN_S
         return bool(self.track.unseen_s > longest + 1e-9)
 

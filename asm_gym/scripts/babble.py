@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from asm_gym.data.episode import Episode, load_episode
@@ -157,7 +158,11 @@ def record_motions(args: Args, console: Console) -> list[Episode]:
 
 
 def record_hours(args: Args, console: Console) -> list[Episode]:
-    """Record the healthy hours of the experts that are missing, and return all in which they succeed."""
+    """Record the healthy hours of the experts that are missing, and return all in which they succeed.
+
+    But for those with a missing number, such as the pose of an object that is out of sight: that is an alarm at
+    whatever threshold.
+    """
     trials = []
     for task in args.shown:
         seeds = role_seeds(HOURS_SEED, task, "hours", args.healthy(task))
@@ -169,7 +174,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
         hours += Corpus.open(args.corpus).episodes(
             *HEALTHY_ROLES, policies=("scripted",), tasks=args.shown
         )
-    return [episode for episode in hours if episode.success]
+    return [e for e in hours if e.success and np.isfinite(e.stream).all()]
 
 
 def pretrain(args: Args, console: Console) -> NeuralASM:

@@ -139,13 +139,17 @@ def harmless(episodes: Sequence[Episode]) -> list[Episode]:
 
 
 def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
-    """Return the stretches of an episode in which nothing presses harder, those of at least ``SHORTEST`` steps."""
+    """Return the stretches of an episode in which nothing presses harder and no number is missing.
+
+    Those of at least ``SHORTEST`` steps.
+    """
     forces = episode.contact_force
     if not len(forces):
         forces = np.zeros(len(episode), np.float32)
     rows = len(episode) // len(forces)  # of the stream, in a step
     torques = peak_torques(episode).reshape(-1, rows).max(axis=1)
-    hit = ~((forces <= limit.force) & (torques <= limit.torque))
+    whole = np.isfinite(episode.stream).all(axis=1).reshape(-1, rows).all(axis=1)
+    hit = ~((forces <= limit.force) & (torques <= limit.torque) & whole)
     around = round(AROUND_S / (rows * episode.spec.dt))
     near = np.convolve(hit, np.ones(2 * around + 1), "same") > 0.5
     pieces = []
