@@ -279,6 +279,15 @@ def test_of_a_policys_own_episodes_crashes_are_left_out_and_what_is_kept_is_whol
     np.testing.assert_array_equal(harmless([acted])[0].stream, acted.stream)
 
 
+def test_rows_with_a_missing_number_are_not_harmless():
+    spec = StreamSpec((Channel("external_torque_peak", 1, "N m"), Channel("pose", 1, "m")), dt=0.05)
+    stream = np.ones((100, 2))
+    stream[50, 1] = np.nan
+    pieces = harmless([Episode.from_stream(stream, spec)])
+    assert [len(piece) for piece in pieces] == [46, 45]
+    assert all(np.isfinite(piece.stream).all() for piece in pieces)
+
+
 def test_a_task_needs_a_solved_lesson_without_noise_and_something_must_be_left():
     crashed = replace(lesson_of([1] * 30, [1] * 30, task="Door"), success=False)
     with pytest.raises(ValueError, match="no undisturbed motion of Door was solved"):

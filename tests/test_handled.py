@@ -262,6 +262,15 @@ def test_an_object_that_is_lifted_while_the_hand_hides_it_is_not_lost():
     assert np.isfinite(rows).all()
 
 
+def test_an_object_that_the_hand_hides_before_its_first_pose_is_not_lost():
+    scene = Scene([0.05, 0.0, 0.0])
+    hand = scene.tracked(quality=TrackerQuality(dropout=1.0))
+    rows = np.array([hand.read(DT) for _ in range(30)])
+    lost = np.isnan(rows).all(axis=1)
+    assert not lost[: round(LONGEST_HIDDEN_S / DT) - 1].any()
+    assert lost[-1]
+
+
 def test_an_object_that_was_near_the_hand_is_lost_after_the_longest_time_that_it_may_be_hidden():
     rows, unseen = hidden_and_lifted(longest_hidden=100)
     is_lost = unseen > LONGEST_HIDDEN_S + 1e-9
