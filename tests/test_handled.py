@@ -118,10 +118,10 @@ def run(path, carried_from=None, let_go_at=None, rng=None, drop=()):
     return sensed
 
 
-def lift(rows=60, start=20):
-    """Return the path (rows, 3) of a hand that stands, and rises from ``start`` on."""
+def lift(rows=60, start=20, speed=0.1):
+    """Return the path (rows, 3) of a hand that stands, and rises at ``speed`` [m/s] from ``start`` on."""
     path = np.zeros((rows, 3))
-    path[start:, 2] = 0.01
+    path[start:, 2] = speed * DT
     return path
 
 
