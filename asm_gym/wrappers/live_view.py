@@ -61,13 +61,20 @@ class LiveView:
         where: ``"view"`` opens the viewer, ``FILE.rrd`` writes a recording, and
             ``rerun+http://HOST:PORT/proxy`` sends to a viewer that runs elsewhere.
         names: of the columns (D,), as the user calls them.
+        has_frames: there is a panel for ``show_frame``.
 
     Raises:
         ImportError: rerun-sdk is not installed.
         ValueError: ``where`` is none of these.
     """
 
-    def __init__(self, monitor: Any, where: str = VIEWER, names: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        monitor: Any,
+        where: str = VIEWER,
+        names: Sequence[str] = (),
+        has_frames: bool = False,
+    ) -> None:
         check_where(where)
         self._rr = require("rerun", what="a live view")
         self._spec = monitor.spec
@@ -77,7 +84,7 @@ class LiveView:
         self._state = ""
         self._expected_before: set[str] = set()  # channels that were expected in the last row
         self._recording: Any = self._rr.RecordingStream("asm-gym")
-        layout = self._layout()
+        layout = self._layout(has_frames)
         if where == VIEWER:
             self._recording.spawn(default_blueprint=layout)
         elif where.endswith(".rrd"):
@@ -87,7 +94,7 @@ class LiveView:
             self._recording.connect_grpc(where, default_blueprint=layout)
         self._name_lines()
 
-    def _layout(self) -> Any:
+    def _layout(self, has_frames: bool) -> Any:
         """Return the panels of the viewer."""
         panels = require("rerun.blueprint", what="a live view")
         surprise = panels.TimeSeriesView(
@@ -107,7 +114,9 @@ class LiveView:
             for channel in self._spec.channels[:MOST_VIEWS]
         ]
         left = panels.Vertical(surprise, state, alarms, row_shares=[3, 1, 2])
-        right = panels.Vertical(worst, camera, row_shares=[1, 2])
+        right = worst
+        if has_frames:
+            right = panels.Vertical(worst, camera, row_shares=[1, 2])
         top = panels.Horizontal(left, right, column_shares=[2, 1])
         return panels.Blueprint(panels.Vertical(top, panels.Grid(*channels)), collapse_panels=True)
 
@@ -241,7 +250,7 @@ class RerunView(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._frame_every = max(1, round(FRAME_S / self._dt))
         self._steps = 0
         self._was_alarm = False
-        self.view = LiveView(monitor, where)
+        self.view = LiveView(monitor, where, has_frames=env.render_mode == "rgb_array")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
