@@ -22,6 +22,7 @@ EXTRAS = {
     "notebooks": ("ipywidgets", "ipykernel", "nbclient", "nbformat"),
     "ros": ("rosbags",),
     "dds": ("cyclonedds",),
+    "rerun": ("rerun",),
 }
 """Packages that each extra of asm-gym installs, by the names they are imported under."""
 BROUGHT_BY = {package: extra for extra, packages in EXTRAS.items() for package in packages}

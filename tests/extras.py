@@ -43,6 +43,7 @@ class Check(NamedTuple):
 CHECKS = {
     "logs": Check("report,ros", "tests/test_logs.py tests/test_live.py", "mcap pandas polars"),
     "dds": Check("report,dds", "tests/test_dds.py"),
+    "rerun": Check("report,rerun", "tests/test_live_view.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py"),
     "agents": Check("agents", "tests/test_learners.py"),
     "learners": Check("learners", "tests/test_learners.py"),
@@ -87,7 +88,7 @@ def check(name: str, wheel: Path) -> str:
 
 EXTRAS = (
     *("robosuite", "report", "data", "agents", "environments", "learners", "notebooks"),
-    *("ros", "video", "dds"),
+    *("ros", "video", "dds", "rerun"),
 )
 STILL_RUNS = (
     "import gymnasium as gym; from asm_gym import NeuralASMSafety; e = NeuralASMSafety(gym.make('asm_gym/Lift-v0'));"

@@ -172,7 +172,7 @@ def test_logs_are_watched_without_a_simulator(tmp_path):
 
 def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    imported_as = {"pillow": "PIL", "scikit-learn": "sklearn"}
+    imported_as = {"pillow": "PIL", "scikit-learn": "sklearn", "rerun-sdk": "rerun"}
 
     def names(requirements):
         found = [re.match(r"[\w.-]+", line).group() for line in requirements]

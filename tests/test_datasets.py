@@ -21,7 +21,7 @@ from minari.dataset.minari_storage import MinariStorage
 from asm_gym import collect
 from asm_gym.data.minari_datasets import read_dataset, write_dataset
 from asm_gym.files import UNFINISHED
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.cli import main
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
@@ -159,6 +159,17 @@ def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7, changed
     return buffers
 
 
+def pendulum_monitor():
+    """A monitor of the pendulum that alarms at nearly everything."""
+    recorder = StreamRecorder(gym.make("Pendulum-v1", max_episode_steps=40))
+    for seed in range(16):
+        recorder.reset(seed=seed)
+        for _ in range(40):
+            recorder.step(recorder.action_space.sample())
+    monitor = make_monitor("kalman", recorder.stream_spec).fit(recorder.episodes[:8])
+    return monitor.calibrate(recorder.episodes[8:], 0.2).with_threshold(1e-3)
+
+
 def test_minari_keeps_what_a_guard_reports(tmp_path):
     env = NeuralASMSafety(FakeEnv(), CueMonitor([3]), on_alarm="monitor")
     infos = [env.reset(seed=0)[1]]
@@ -172,6 +183,25 @@ def test_minari_keeps_what_a_guard_reports(tmp_path):
         alarms = [json.loads(text)["alarm"] for text in kept["asm"]]
     assert alarms == [info["asm"]["alarm"] for info in infos]
     assert sum(alarms) == 1
+
+
+def test_minaris_own_collector_records_a_guarded_environment(tmp_path, monkeypatch):
+    pytest.importorskip("jax", reason="pip install 'minari[create]'")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    guarded = NeuralASMSafety(gym.make("Pendulum-v1"), pendulum_monitor(), on_alarm="monitor")
+    collector = minari.DataCollector(guarded, record_infos=True)
+    alarms = []
+    collector.reset(seed=0)
+    for _ in range(200):
+        *_, truncated, info = collector.step(collector.action_space.sample())
+        alarms.append(info["asm_alarm"])
+    assert truncated
+    dataset = collector.create_dataset("guarded/pendulum-v0", algorithm_name="sway")
+    collector.close()
+    episode = next(iter(dataset.iterate_episodes()))
+    np.testing.assert_array_equal(episode.infos["asm_alarm"][1:], alarms)
+    assert dataset.total_episodes == 1
+    assert any(alarms)
 
 
 def test_a_dataset_of_somebody_elses_environment_is_read_as_observation_and_action(tmp_path):

@@ -205,6 +205,8 @@ class LiveWatch(Adapter):
         self._check_watchdog()
         self.report_step([report], row)
         self._desk.after_row(self._now, row, report, self._book)
+        if self._settings.show is not None:
+            self._settings.show(self._now, row.numbers, report)
 
     def _check_reading(self, row: Row, arrival: float) -> None:
         """Say what is wrong with the line, the clock or the rate."""

@@ -6,9 +6,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from asm_gym.data.schema import LogSchema
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.guard.operator_orders import Orders
+from asm_gym.guard.step_info import RowReport
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +36,8 @@ class WatchSettings:
     acknowledges: tuple[str, ...] = ()
     keep: Path | None = None  # file for the memory with the level shifts that were learned
     following: FollowingThreshold | None = None  # the threshold that follows
+    # Called with the time [s], the numbers (D,) and the report of each row, after its alarm is told.
+    show: Callable[[float, NDArray[np.float64], RowReport], None] | None = None
 
 
 USUAL = WatchSettings()

@@ -51,11 +51,12 @@ from asm_gym.scripts.command import BAD_NEWS, DONE, REFUSED, option, origin, run
 from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 from asm_gym.scripts.recording_review import Review, say_events, say_table
 from asm_gym.validation import check_number
+from asm_gym.wrappers.live_view import LiveView, check_where
 
 INCIDENTS = "incidents"  # folder of the rows around alarms
 AT_ONCE = 64  # episodes scored side by side
 # Options of a live source.
-LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy", "acknowledge", "keep")
+LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy", "acknowledge", "keep", "rerun")
 RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")  # options of a recording
 
 
@@ -96,6 +97,9 @@ class Args(LogOptions):
     """Channels of a live source, or all: the level shift of an open alarm is learned as soon as it is steady. By hand:
     the key a in a terminal, or the line 'acknowledge [ALARM]' on standard input; s, or 'snooze [SECONDS [ALARM]]',
     keeps an alarm silent for a time, 600 s by default. Both end with the run."""
+    rerun: str | None = option(None, check=check_where, metavar="view|FILE.rrd|URL")
+    """Show a live source in Rerun's viewer: view opens it, FILE.rrd is a recording for it, and
+    rerun+http://HOST:PORT/proxy a viewer that runs elsewhere."""
     keep: Path | None = option(None, metavar="FILE.asm")
     """File to write the memory to, with the level shifts that were acknowledged."""
     follow_threshold: Path | None = option(None, metavar="FILE.json")
@@ -224,7 +228,10 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
         lines = without_orders(lines, orders)
         own_input = None
     beat = None
-    outlets = outlets_of(args, console)
+    view = None
+    if args.rerun is not None:
+        view = LiveView(monitor, args.rerun, schema_of(args, monitor).names_in_logs)
+    outlets = outlets_of(args, console, view)
     with _watchdog(args, monitor.spec.dt) as watchdog, taken_from(own_input, orders):
         announcement = f"watching {args.source}"
         if watchdog is not None:
@@ -245,11 +252,14 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
             acknowledges=args.acknowledge,
             keep=args.keep,
             following=following_of(args, monitor),
+            show=None if view is None else view.show_report,
         )
         try:
             alarms = follow(lines, monitor, outlets.say, settings)
         finally:
             outlets.close()
+            if view is not None:
+                view.close()
     if outlets.output_failed:
         return REFUSED
     if alarms:
@@ -267,14 +277,16 @@ def following_of(args: Args, monitor: Any) -> FollowingThreshold | None:
     )
 
 
-def outlets_of(args: Args, console: Console) -> AlarmOutlets:
-    """Return the outlets of events: first the hook, then the topic of ROS 2, then standard output."""
+def outlets_of(args: Args, console: Console, view: LiveView | None) -> AlarmOutlets:
+    """Return the outlets of events: first the hook, then the topic of ROS 2, the live view, then standard output."""
     outlets: list[Callable[[LiveEvent], object]] = []
     if args.hook:
         outlets.append(partial(run_hook, args.hook))
     if args.topic:
         publish_text = publisher(args.topic)
         outlets.append(lambda event: publish_text(event.to_json()))
+    if view is not None:
+        outlets.append(view.show_event)
     return AlarmOutlets(outlets, LineWriter(console.file), args.json)
 
 

@@ -133,6 +133,16 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Surprise above which a row is an alarm in this episode."""
         return float(self.guard.threshold[0])
 
+    @property
+    def newest_row(self) -> Floats32 | None:
+        """(D,) the row that was sensed last in this episode, as the monitor reads it; None before the first step."""
+        return self._row
+
+    @property
+    def control_period(self) -> float:
+        """Time that a step takes [s]."""
+        return self._period
+
     def confirm_alarm(self) -> None:
         """Confirm that the alarms of this episode were real, for ``adaptive_threshold``."""
         self.guard.confirm(np.ones(1, bool))
