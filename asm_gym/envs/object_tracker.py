@@ -49,6 +49,7 @@ TRACK = np.dtype(
         ("carrier_before", np.float64),  # before it was undecided
         ("undecided_s", np.float64),
         ("poses", np.int64),  # measured since the object was taken up
+        ("measured", np.float64, 3),  # position of the last pose [m]
         ("unseen_s", np.float64),  # since the last pose
         # of object and hand when the fingers moved last [m]
         ("object_start", np.float64, 3),
@@ -122,6 +123,7 @@ def correct(track: Any, position: Floats, orientation: Floats, period: float) ->
     """Correct the filter by a measured pose (3,) [m], (3, 3); poses are measured every ``period`` [s]."""
     track.unseen_s = 0.0
     track.poses += 1
+    track.measured[:] = position
     if track.poses == 1:
         track.position[:] = position
         track.orientation[:, :] = orientation
@@ -169,14 +171,25 @@ def end_doubt(track: Any, hand: Any, dt: float) -> None:
     track.undecided_s += dt
     way = hand.position - track.hand_start
     length = np.sqrt(np.sum(way**2))
-    if length > DECIDED_AFTER:
-        along = np.sum((track.position - track.object_start) * way) / length**2
+    if length > DECIDED_AFTER and track.unseen_s == 0.0:
+        along = np.sum((track.measured - track.object_start) * way) / length**2
         carrier = RESTS
         if along > GOES_ALONG:
             carrier = CARRIED
         change_carrier(track, hand, carrier)
+        if carrier == CARRIED:
+            hold(track)
     elif track.undecided_s > LONGEST_UNDECIDED_S:
         change_carrier(track, hand, track.carrier_before)
+
+
+@inner
+def hold(track: Any) -> None:
+    """Take an object to be where it was measured, and to rest in the hand: the filter is late by the hand's motion."""
+    for i in range(3):
+        track.position[i] = track.measured[i]
+        track.velocity[i] = 0.0
+        track.turn_rate[i] = 0.0
 
 
 @inner
