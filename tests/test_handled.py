@@ -125,12 +125,16 @@ def lift(rows=60, start=20, speed=0.1):
     return path
 
 
-def test_an_object_that_is_grasped_is_undecided_and_then_moves_with_the_hand():
-    carried = run(lift(), carried_from=20)[:, -1]
+@pytest.mark.parametrize("speed", [0.05, 0.2, 0.5])
+def test_an_object_that_is_grasped_is_undecided_and_then_moves_with_the_hand(speed):
+    sensed = run(lift(speed=speed), carried_from=20)
+    carried = sensed[:, -1]
     assert carried[0] == NO_POSE
     assert set(carried[5:15]) == {RESTS}
     assert carried[18] == UNDECIDED
-    assert set(carried[35:]) == {CARRIED}
+    assert set(carried[45:]) == {CARRIED}
+    np.testing.assert_allclose(sensed[50:, :3], np.tile([0.02, 0.0, -0.01], (10, 1)), atol=0.01)
+    assert np.abs(sensed[50:, 3:6]).max() < 0.02
 
 
 def test_fingers_that_close_on_nothing_leave_the_object_at_rest():

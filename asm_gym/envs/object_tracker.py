@@ -8,7 +8,7 @@ lets motion of up to 0.7 Hz through (-3 dB), velocities of up to 0.4 Hz, and of 
 that is missing is predicted.
 
 Only where fingers move at the object does its carrier become undecided. It is decided once the hand has gone 5 cm since
-they stopped: the object is carried if it has gone more than 0.35 of that way.
+they stopped: the object is carried if its pose has gone more than 0.35 of that way. From then on it rests in the hand.
 
 Source: Kalata 1984 (IEEE Trans. Aerospace and Electronic Systems 20(2)) for the gains of an α-β filter.
 """
