@@ -357,7 +357,8 @@ EVALUATE = [
 ]
 
 
-def test_any_environment_can_be_evaluated(tmp_path, capsys):
+def test_any_environment_can_be_evaluated(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
     assert (
         main(
             [

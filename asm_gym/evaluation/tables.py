@@ -56,20 +56,21 @@ class Table:
         widths = [max(map(_longest_word, cells)) for cells in columns]
         while len(widths) > FEWEST_SHOWN and _table_width(widths) > available:
             widths.pop()
-        lines = [max(map(cell_len, cells)) for cells in columns[: len(widths)]]
         for _ in range(available - _table_width(widths)):
-            wraps = [
-                (math.ceil(line / width), -line) for line, width in zip(lines, widths, strict=True)
-            ]
-            most = wraps.index(max(wraps))  # of those with most lines, what takes least to mend
-            if wraps[most][0] <= 1:
+            more = [_extra_lines(*column) for column in zip(columns, widths, strict=False)]
+            if not any(more):
                 break
-            widths[most] += 1
+            widths[more.index(max(more))] += 1
         return widths
 
 
 def _longest_word(text: str) -> int:
     return max(map(cell_len, text.split()), default=1)
+
+
+def _extra_lines(cells: Sequence[str], width: int) -> int:
+    """Return how many lines cells take beyond one each, about."""
+    return sum(max(math.ceil(cell_len(cell) / width) - 1, 0) for cell in cells)
 
 
 def _table_width(widths: Sequence[int]) -> int:

@@ -35,6 +35,7 @@ from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.stream_source import StreamSource
+from asm_gym.stream_view import StreamView
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_number
@@ -163,16 +164,18 @@ def speeds(name: object, members: int, seconds: dict[str, NDArray[np.float64]]) 
     return str(name), *rates, *shares
 
 
-def observing_steps(env: Any, memory: NeuralASM, count: int) -> Callable[[Any], None]:
+def observing_steps(
+    env: Any, memory: NeuralASM, view: StreamView, count: int
+) -> Callable[[Any], None]:
     """Return a step of ``count`` environments whose rows a memory observes: no guard can cost less."""
     state = memory.initial_state(count)
 
     def step(action: Any) -> None:
         nonlocal state
         info = env.step(action)[-1]
-        rows = np.asarray(info.get("streams", info["stream"])).reshape(-1, count, memory.spec.size)
-        for row in rows:
-            state, _ = memory.observe(state, row)
+        rows = np.asarray(info.get("streams", info["stream"]))
+        for row in rows.reshape(-1, count, rows.shape[-1]):
+            state, _ = memory.observe(state, view.rows(row))
 
     return step
 
@@ -183,18 +186,21 @@ def measure_safety(args: Args, console: Console) -> Table:
     turns = max(1, args.steps // SECOND)
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
         with closing(_made(args.task, rate)) as bare, closing(_made(args.task, rate)) as inner:
-            memory = body_memory(inner, StreamSource(inner).spec).with_threshold(NEVER)
-            guarded = NeuralASMSafety(inner, memory)
-            rivals = _guarded_rivals(guarded, bare, memory, 1, args.seed)
+            spec = StreamSource(inner).spec
+            memory = body_memory(inner, spec).with_threshold(NEVER)
+            observing = observing_steps(bare, memory, StreamView(spec, memory.spec), 1)
+            rivals = _guarded_rivals(NeuralASMSafety(inner, memory), bare, observing, args.seed)
             rows.append(speeds(name, 1, take_turns(rivals, turns, args.seed, console)))
 
     most = max(args.members)
     alone = vectors_of([_made(args.task) for _ in range(most)], args.members)
     watched = vectors_of([_made(args.task) for _ in range(most)], args.members)
     for n, vector in watched.items():
-        memory = body_memory(vector, vector.get_attr("stream_spec")[0]).with_threshold(NEVER)
+        spec = vector.get_attr("stream_spec")[0]
+        memory = body_memory(vector, spec).with_threshold(NEVER)
+        observing = observing_steps(alone[n], memory, StreamView(spec, memory.spec), n)
         wrapped = VectorNeuralASMSafety(vector, memory)
-        rivals = _guarded_rivals(wrapped, alone[n], memory, n, args.seed)
+        rivals = _guarded_rivals(wrapped, alone[n], observing, args.seed)
         seconds = take_turns(rivals, turns, args.seed, console)
         rows.append(speeds(f"vector of {n}", n, seconds))
     headings = (
@@ -208,11 +214,11 @@ def measure_safety(args: Args, console: Console) -> Table:
     return Table(f"Control steps of {args.task} a second, shipped memory", headings, rows)
 
 
-def _guarded_rivals(guarded: Any, bare: Any, memory: NeuralASM, count: int, seed: int) -> Rivals:
-    """Return a second of ``count`` environments: guarded, bare, and bare with a memory that observes."""
+def _guarded_rivals(guarded: Any, bare: Any, observing: Callable[[Any], None], seed: int) -> Rivals:
+    """Return a second of environments: guarded, bare, and bare with a memory that is ``observing``."""
     steps = {
         "guarded": guarded.step,
-        "memory alone": observing_steps(bare, memory, count),
+        "memory alone": observing,
         "bare": bare.step,
     }
     action = np.zeros(bare.action_space.shape, np.float32)
