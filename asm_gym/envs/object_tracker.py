@@ -15,7 +15,7 @@ Source: Kalata 1984 (IEEE Trans. Aerospace and Electronic Systems 20(2)) for the
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,6 +99,30 @@ def clear(track: Any) -> None:
     for i in range(3):
         track.velocity[i] = 0.0
         track.turn_rate[i] = 0.0
+
+
+class Pose(NamedTuple):
+    """A measured pose."""
+
+    is_seen: bool
+    position: Floats  # (3,) in the world [m]
+    orientation: Floats  # (3, 3)
+
+
+UNSEEN = Pose(is_seen=False, position=np.zeros(3), orientation=np.eye(3))
+
+
+@compiled
+def follow(
+    track: Any, hand: Any, elapsed: float, pose: Pose, period: float, numbers: Floats
+) -> float:
+    """Take the track on by ``elapsed`` [s] and a pose, write its sense (SENSED,), and return its distance [m]."""
+    predict(track, hand, elapsed)
+    if pose.is_seen:
+        correct(track, pose.position, pose.orientation, period)
+    decide(track, hand, elapsed)
+    write_sense(track, hand, numbers)
+    return float(np.sqrt(np.sum((track.position - hand.position) ** 2)))
 
 
 @compiled

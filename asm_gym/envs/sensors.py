@@ -279,7 +279,8 @@ class Senses:
         if faults or tracker is not None:
             was_finite = bool(np.isfinite(row).all())
         if tracker is not None:
-            row = np.insert(row, self._tracked[0], tracker.read())
+            place = self._tracked[0]
+            row = np.concatenate([row[:place], tracker.read(), row[place:]])
         for corrupt in faults:
             corrupt(row)
 

@@ -25,14 +25,13 @@ from asm_gym.envs.object_tracker import (
     CARRIED,
     SENSED,
     UNDECIDED,
+    UNSEEN,
+    Pose,
     clear,
-    correct,
-    decide,
+    follow,
     new_hand,
     new_track,
-    predict,
     rotation,
-    write_sense,
 )
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import CARRIED_CHANNEL, HANDLED, Channel
@@ -136,6 +135,11 @@ class TrackedHand:
         self._quality = quality
         self.track = new_track()
         self._hand = new_hand()
+        # their fields, as attributes of records take microseconds
+        tracks, hands = self.track.base, self._hand.base
+        self._poses, self._unseen_s, self._carrier = tracks.poses, tracks.unseen_s, tracks.carrier
+        self._hand_pose = hands.position[0], hands.orientation[0]
+        self._hand_motion = hands.velocity[0], hands.turn_rate[0], hands.fingers_move
         self._numbers = np.zeros(SENSED)
         self.begin_episode(np.random.default_rng(0))
 
@@ -159,31 +163,33 @@ class TrackedHand:
         self._look_at_hand()
         distances = self._distances()
         self._choose(distances, elapsed)
-        predict(self.track, self._hand, elapsed)
         self._pose_due_s -= elapsed
+        pose = None
         if self._pose_due_s <= 1e-9:
             self._pose_due_s += self._quality.period
-            self._measure()
-        decide(self.track, self._hand, elapsed)
-        if self._is_lost():
+            pose = self._measured()
+        distance = follow(
+            self.track, self._hand, elapsed, pose or UNSEEN, self._quality.period, self._numbers
+        )
+        if self._is_lost(distance):
             return np.full(SENSED, np.nan)
-        write_sense(self.track, self._hand, self._numbers)
         return self._numbers + self._noise * HAND_NOISE * self._rng.standard_normal(SENSED)
 
     def _look_at_hand(self) -> None:
         """Read pose and motion of the hand, which the arm's own sensors measure well."""
-        hand = self._hand
-        hand.position[:] = self._data.site_xpos[self._site]
-        hand.orientation[:] = self._data.xmat[self._body].reshape(3, 3)
+        position, orientation = self._hand_pose
+        velocity, turn_rate, fingers_move = self._hand_motion
+        position[:] = self._data.site_xpos[self._site]
+        orientation[:] = self._data.xmat[self._body].reshape(3, 3)
         twist = self._motion[kernels.VELOCITY]
-        hand.velocity[:] = twist[:3]
-        hand.turn_rate[:] = twist[3:]
+        velocity[:] = twist[:3]
+        turn_rate[:] = twist[3:]
         speeds = np.abs(self._data.qvel[self._fingers])
-        hand.fingers_move = bool((speeds > FINGERS_MOVE).any())
+        fingers_move[0] = (speeds > FINGERS_MOVE).any()
 
     def _distances(self) -> Floats:
         """Return the distances (N,) of the objects from the fingers [m]."""
-        offsets = self._data.xpos[self._bodies] - self._hand.position
+        offsets = self._data.xpos[self._bodies] - self._hand_pose[0]
         return np.sqrt(np.einsum("ni,ni->n", offsets, offsets))
 
     def _choose(self, distances: Floats, elapsed: float) -> None:
@@ -192,12 +198,12 @@ class TrackedHand:
             return
         nearest = int(distances.argmin())
         body = int(self._bodies[nearest])
-        gave_up = self.track.unseen_s > GIVEN_UP_S
+        gave_up = self._unseen_s[0] > GIVEN_UP_S
         if self.target < 0 or (gave_up and body != self.target):
             if distances[nearest] < VIEW:
                 self._take_up(body)
             return
-        is_handled = self.track.carrier in (CARRIED, UNDECIDED)
+        is_handled = self._carrier[0] in (CARRIED, UNDECIDED)
         own = distances[self._bodies == self.target]
         nearer = bool(own.size) and distances[nearest] < own[0] - NEARER_BY
         if is_handled or not nearer or own[0] > VIEW:
@@ -218,25 +224,25 @@ class TrackedHand:
         self._was_near = False
         clear(self.track)
 
-    def _measure(self) -> None:
-        """Correct the track by a pose of the object, if it is seen."""
+    def _measured(self) -> Pose | None:
+        """Return a measured pose of the object, if it is seen."""
         if self.target < 0:
-            return
+            return None
         quality = self._quality
         position_error = quality.position_noise * self._noise * self._rng.standard_normal(3)
         turn_error = quality.turn_noise * self._noise * self._rng.standard_normal(3)
         is_dropped, begins_to_hide, shows_again = self._rng.random(3)
         position = self._data.xpos[self.target]
-        distance = float(np.linalg.norm(position - self._hand.position))
+        distance = float(np.linalg.norm(position - self._hand_pose[0]))
         self._hide(distance, begins_to_hide, shows_again)
         is_seen = distance < VIEW and not self._hidden and is_dropped >= quality.dropout
         if not is_seen:
-            return
+            return None
         self._shown += 1
         self._was_near = False
         orientation = self._data.xmat[self.target].reshape(3, 3)
         turned = rotation(turn_error) @ orientation
-        correct(self.track, position + position_error, turned, quality.period)
+        return Pose(True, position + position_error, turned)
 
     def _hide(self, distance: float, begins_to_hide: float, shows_again: float) -> None:
         """Begin to hide the object by the hand, go on with it or end it, by draws from [0, 1)."""
@@ -250,17 +256,19 @@ class TrackedHand:
         elif distance < NEAR_HAND and self._shown >= 3 and begins_to_hide < quality.hiding:
             self._hidden = 1
 
-    def _is_lost(self) -> bool:
-        """Return whether the pose of an object has been missing for longer than the hand may hide it."""
+    def _is_lost(self, distance: float) -> bool:
+        """Return whether the pose of an object has been missing for longer than the hand may hide it.
+
+        ``distance`` [m] is how far from the fingers the filter believes it to be.
+        """
         if self.target < 0:
             return False
-        offset = self.track.position - self._hand.position
-        if self.track.poses and np.linalg.norm(offset) < NEAR_ESTIMATE:
+        if self._poses[0] and distance < NEAR_ESTIMATE:
             self._was_near = True
         longest = LONGEST_UNSEEN_S
-        if self._was_near or not self.track.poses:
+        if self._was_near or not self._poses[0]:
             longest = LONGEST_HIDDEN_S
-        return bool(self.track.unseen_s > longest + 1e-9)
+        return bool(self._unseen_s[0] > longest + 1e-9)
 
 
 def _channels(prefix: str, quality: TrackerQuality) -> list[Channel]:
