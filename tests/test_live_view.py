@@ -112,6 +112,17 @@ def test_a_viewer_that_fails_ends_the_view_and_not_the_watch(asm, tmp_path, caps
     assert "the live view ends" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("show", ["show_text", "show_frame"])
+def test_an_alarm_or_a_frame_that_cannot_be_shown_ends_the_view_alone(asm, tmp_path, capsys, show):
+    needs("rerun")
+    view = LiveView(asm, str(tmp_path / "x.rrd"))
+    broken = {"show_text": (None, object()), "show_frame": (object(),)}
+    getattr(view, show)(*broken[show])
+    view.show_row(0.1, np.zeros(SPEC.size), np.zeros(SPEC.size), 0.5, "policy")
+    view.close()
+    assert capsys.readouterr().err.count("the live view ends") == 1
+
+
 @pytest.mark.parametrize(
     ("where", "message"), [("viewer", "FILE.rrd"), ("x.rrd", "rerun: pip install 'asm-gym[rerun]'")]
 )

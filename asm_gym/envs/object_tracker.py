@@ -71,6 +71,17 @@ HAND = np.dtype(
 )
 """A hand at a row."""
 
+
+class Pose(NamedTuple):
+    """A measured pose."""
+
+    is_seen: bool
+    position: Floats  # (3,) in the world [m]
+    orientation: Floats  # (3, 3)
+
+
+UNSEEN = Pose(is_seen=False, position=np.zeros(3), orientation=np.eye(3))
+
 SENSED = 10  # numbers of the sense: position, velocity, turn rate, and how the object moves
 
 
@@ -88,6 +99,11 @@ def new_hand() -> Any:
     return hand
 
 
+def views_of(record: Any) -> dict[str, Any]:
+    """Return the fields of a record of ``TRACK`` or ``HAND`` by name, each an array (1, ...) that shares its memory."""
+    return {name: record.base[name] for name in record.dtype.names}
+
+
 @compiled
 def clear(track: Any) -> None:
     """Forget the object."""
@@ -99,17 +115,6 @@ def clear(track: Any) -> None:
     for i in range(3):
         track.velocity[i] = 0.0
         track.turn_rate[i] = 0.0
-
-
-class Pose(NamedTuple):
-    """A measured pose."""
-
-    is_seen: bool
-    position: Floats  # (3,) in the world [m]
-    orientation: Floats  # (3, 3)
-
-
-UNSEEN = Pose(is_seen=False, position=np.zeros(3), orientation=np.eye(3))
 
 
 @compiled

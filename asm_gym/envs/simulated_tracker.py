@@ -32,6 +32,7 @@ from asm_gym.envs.object_tracker import (
     new_hand,
     new_track,
     rotation,
+    views_of,
 )
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import CARRIED_CHANNEL, HANDLED, Channel
@@ -135,11 +136,9 @@ class TrackedHand:
         self._quality = quality
         self.track = new_track()
         self._hand = new_hand()
-        # their fields, as attributes of records take microseconds
-        tracks, hands = self.track.base, self._hand.base
-        self._poses, self._unseen_s, self._carrier = tracks.poses, tracks.unseen_s, tracks.carrier
-        self._hand_pose = hands.position[0], hands.orientation[0]
-        self._hand_motion = hands.velocity[0], hands.turn_rate[0], hands.fingers_move
+        # Views of their fields, each an array (1, ...): an attribute of a record takes microseconds.
+        self._tracks = views_of(self.track)
+        self._hands = views_of(self._hand)
         self._numbers = np.zeros(SENSED)
         self.begin_episode(np.random.default_rng(0))
 
@@ -164,32 +163,30 @@ class TrackedHand:
         distances = self._distances()
         self._choose(distances, elapsed)
         self._pose_due_s -= elapsed
-        pose = None
+        pose = UNSEEN
         if self._pose_due_s <= 1e-9:
             self._pose_due_s += self._quality.period
             pose = self._measured()
-        distance = follow(
-            self.track, self._hand, elapsed, pose or UNSEEN, self._quality.period, self._numbers
-        )
+        period = self._quality.period
+        distance = follow(self.track, self._hand, elapsed, pose, period, self._numbers)
         if self._is_lost(distance):
             return np.full(SENSED, np.nan)
         return self._numbers + self._noise * HAND_NOISE * self._rng.standard_normal(SENSED)
 
     def _look_at_hand(self) -> None:
         """Read pose and motion of the hand, which the arm's own sensors measure well."""
-        position, orientation = self._hand_pose
-        velocity, turn_rate, fingers_move = self._hand_motion
-        position[:] = self._data.site_xpos[self._site]
-        orientation[:] = self._data.xmat[self._body].reshape(3, 3)
+        hands = self._hands
+        hands["position"][0] = self._data.site_xpos[self._site]
+        hands["orientation"][0] = self._data.xmat[self._body].reshape(3, 3)
         twist = self._motion[kernels.VELOCITY]
-        velocity[:] = twist[:3]
-        turn_rate[:] = twist[3:]
+        hands["velocity"][0] = twist[:3]
+        hands["turn_rate"][0] = twist[3:]
         speeds = np.abs(self._data.qvel[self._fingers])
-        fingers_move[0] = (speeds > FINGERS_MOVE).any()
+        hands["fingers_move"][0] = (speeds > FINGERS_MOVE).any()
 
     def _distances(self) -> Floats:
         """Return the distances (N,) of the objects from the fingers [m]."""
-        offsets = self._data.xpos[self._bodies] - self._hand_pose[0]
+        offsets = self._data.xpos[self._bodies] - self._hands["position"]
         return np.sqrt(np.einsum("ni,ni->n", offsets, offsets))
 
     def _choose(self, distances: Floats, elapsed: float) -> None:
@@ -198,12 +195,12 @@ class TrackedHand:
             return
         nearest = int(distances.argmin())
         body = int(self._bodies[nearest])
-        gave_up = self._unseen_s[0] > GIVEN_UP_S
+        gave_up = self._tracks["unseen_s"][0] > GIVEN_UP_S
         if self.target < 0 or (gave_up and body != self.target):
             if distances[nearest] < VIEW:
                 self._take_up(body)
             return
-        is_handled = self._carrier[0] in (CARRIED, UNDECIDED)
+        is_handled = self._tracks["carrier"][0] in (CARRIED, UNDECIDED)
         own = distances[self._bodies == self.target]
         nearer = bool(own.size) and distances[nearest] < own[0] - NEARER_BY
         if is_handled or not nearer or own[0] > VIEW:
@@ -224,25 +221,25 @@ class TrackedHand:
         self._was_near = False
         clear(self.track)
 
-    def _measured(self) -> Pose | None:
-        """Return a measured pose of the object, if it is seen."""
+    def _measured(self) -> Pose:
+        """Return a measured pose of the object; ``UNSEEN`` where it is not seen."""
         if self.target < 0:
-            return None
+            return UNSEEN
         quality = self._quality
         position_error = quality.position_noise * self._noise * self._rng.standard_normal(3)
         turn_error = quality.turn_noise * self._noise * self._rng.standard_normal(3)
         is_dropped, begins_to_hide, shows_again = self._rng.random(3)
         position = self._data.xpos[self.target]
-        distance = float(np.linalg.norm(position - self._hand_pose[0]))
+        distance = float(np.linalg.norm(position - self._hands["position"][0]))
         self._hide(distance, begins_to_hide, shows_again)
         is_seen = distance < VIEW and not self._hidden and is_dropped >= quality.dropout
         if not is_seen:
-            return None
+            return UNSEEN
         self._shown += 1
         self._was_near = False
         orientation = self._data.xmat[self.target].reshape(3, 3)
         turned = rotation(turn_error) @ orientation
-        return Pose(True, position + position_error, turned)
+        return Pose(is_seen=True, position=position + position_error, orientation=turned)
 
     def _hide(self, distance: float, begins_to_hide: float, shows_again: float) -> None:
         """Begin to hide the object by the hand, go on with it or end it, by draws from [0, 1)."""
@@ -263,12 +260,12 @@ class TrackedHand:
         """
         if self.target < 0:
             return False
-        if self._poses[0] and distance < NEAR_ESTIMATE:
+        if self._tracks["poses"][0] and distance < NEAR_ESTIMATE:
             self._was_near = True
         longest = LONGEST_UNSEEN_S
-        if self._was_near or not self._poses[0]:
+        if self._was_near or not self._tracks["poses"][0]:
             longest = LONGEST_HIDDEN_S
-        return bool(self._unseen_s[0] > longest + 1e-9)
+        return bool(self._tracks["unseen_s"][0] > longest + 1e-9)
 
 
 def _channels(prefix: str, quality: TrackerQuality) -> list[Channel]:

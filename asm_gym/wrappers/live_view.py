@@ -12,7 +12,8 @@ Source: https://rerun.io (rerun-sdk 0.41).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,28 @@ def check_where(where: str) -> str:
         f"a live view needs {VIEWER}, a file FILE.rrd or an address rerun+http://HOST:PORT/proxy, "
         f"got {where!r}"
     )
+
+
+def until_it_fails(show: Callable[..., None]) -> Callable[..., None]:
+    """Return a method of ``LiveView`` whose first error ends the view; after that it does nothing."""
+
+    @wraps(show)
+    def shown(view: LiveView, *args: Any, **kwargs: Any) -> None:
+        if view._recording is None:
+            return
+        try:
+            show(view, *args, **kwargs)
+        except Exception as error:
+            view._give_up(error)
+
+    return shown
+
+
+def shown_state(state: str, is_alarm: bool) -> str:
+    """Return who acts, or that a policy goes on in alarm."""
+    if is_alarm and state == STATES[0]:
+        return ALARM
+    return state
 
 
 class LiveView:
@@ -136,12 +159,11 @@ class LiveView:
     def show_report(self, time: float, numbers: Row, report: RowReport) -> None:
         """Show a row (D,) at ``time`` [s] as a guard has judged it."""
         robot = report.robots[0]
-        state = STATES[robot["state"]]
-        if robot["alarm"] and state == STATES[0]:
-            state = ALARM
+        state = shown_state(STATES[robot["state"]], bool(robot["alarm"]))
         strength = float(robot["surprise"] / robot["threshold"])
         self.show_row(time, numbers, report.attribution[0], strength, state)
 
+    @until_it_fails
     def show_row(self, time: float, numbers: Row, shares: Row, strength: float, state: str) -> None:
         """Show a row.
 
@@ -152,19 +174,14 @@ class LiveView:
             strength: its surprise in thresholds.
             state: who acts, or ``"alarm"``.
         """
-        if self._recording is None:
-            return
-        try:
-            self._rows = [*self._rows[-1:], np.array(numbers, np.float64)]
-            self._recording.set_time("time", duration=time)
-            self._recording.log("surprise", self._rr.Scalars(min(strength, MOST_SHOWN)))
-            self._recording.log("threshold", self._rr.Scalars(1.0))
-            if state != self._state:
-                self._recording.log("state", self._rr.StateChange(state=state))
-                self._state = state
-            self._show_channels(shares)
-        except Exception as error:
-            self._give_up(error)
+        self._rows = [*self._rows[-1:], np.array(numbers, np.float64)]
+        self._recording.set_time("time", duration=time)
+        self._recording.log("surprise", self._rr.Scalars(min(strength, MOST_SHOWN)))
+        self._recording.log("threshold", self._rr.Scalars(1.0))
+        if state != self._state:
+            self._recording.log("state", self._rr.StateChange(state=state))
+            self._state = state
+        self._show_channels(shares)
 
     def about(self, shares: Row) -> str:
         """Return what the channel with the largest share (D,) of the newest row read, and what was expected."""
@@ -178,16 +195,16 @@ class LiveView:
         """Show an alarm or a note as text."""
         self.show_text(event.time, str(event))
 
+    @until_it_fails
     def show_text(self, time: float, text: str) -> None:
         """Show the text of an alarm at ``time`` [s]."""
-        if self._recording is not None:
-            self._recording.set_time("time", duration=time)
-            self._recording.log("alarms", self._rr.TextLog(text, level="WARN"))
+        self._recording.set_time("time", duration=time)
+        self._recording.log("alarms", self._rr.TextLog(text, level="WARN"))
 
+    @until_it_fails
     def show_frame(self, frame: NDArray[np.uint8]) -> None:
         """Show a picture (H, W, 3) of the environment beside the newest row."""
-        if self._recording is not None:
-            self._recording.log("camera", self._rr.Image(frame).compress())
+        self._recording.log("camera", self._rr.Image(frame).compress())
 
     def close(self) -> None:
         """Write what is left to write."""
@@ -264,9 +281,7 @@ class RerunView(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         numbers = self.env.get_wrapper_attr("newest_row")
         self._steps += 1
         time = self._steps * self._dt
-        state = asm["state"]
-        if asm["alarm"] and state == STATES[0]:
-            state = ALARM
+        state = shown_state(asm["state"], asm["alarm"])
         shares = np.array(list(asm["attribution"].values()))
         strength = asm["surprise"] / asm["threshold"]
         self.view.show_row(time, numbers, shares, strength, state)
