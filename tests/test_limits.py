@@ -165,3 +165,23 @@ def test_hands_and_grippers_are_told_apart_from_joints():
         "qd": "joint speed",
     }
     assert {name: kind_of(Channel(name, 1)) for name in kinds} == kinds
+
+
+def test_a_servo_of_lerobot_is_limited_by_what_each_number_is_named():
+    servos = ("elbow.pos", "elbow.current", "gripper.current", "elbow.temperature", "elbow.vel")
+    state = Channel("observation.state", 5, elements=servos)
+    action = Channel("action", 1, group=MOTOR, elements=("elbow.pos",))
+    spec = StreamSpec((state, action), dt=0.05)
+    rng = np.random.default_rng(0)
+    episodes = [Episode.from_stream(rng.normal(size=(40, 6)), spec) for _ in range(40)]
+    monitor = make_monitor("kalman", spec).fit(episodes[:20])
+    limits = monitor.calibrate(episodes[20:], false_alarm_rate=0.05).limits()
+    assert [(limit.kind, limit.label) for limit in limits.limits] == [
+        ("joint position", "observation.state[elbow.pos]"),
+        ("current", "observation.state[elbow.current]"),
+        ("current", "observation.state[gripper.current]"),
+        ("joint speed", "observation.state[elbow.vel]"),
+    ]
+    current = limits.of("current")[0]
+    assert current.low == -current.high
+    assert current.high == pytest.approx(1.25 * max(-current.least, current.most))

@@ -135,11 +135,18 @@ def limits_of(monitor: Any, margin: float = MARGIN) -> RobotLimits:
     )
 
 
-def kind_of(channel: Channel) -> str:
-    """Return what a channel senses that a robot can be limited in; empty for anything else."""
+def kind_of(channel: Channel, element: str = "") -> str:
+    """Return what a channel senses that a robot can be limited in; empty for anything else.
+
+    Args:
+        channel: of the stream.
+        element: name of one of its numbers. One with a dot, as LeRobot's ``elbow_flex.current``, tells what it is.
+    """
     name = channel.name.lower().removesuffix("_peak")
     if channel.group == MOTOR or "gripper" in name:
         return ""
+    if "." in element:
+        name = element.lower()
     for kind, pattern in KINDS.items():
         if re.search(pattern, name):
             return kind
@@ -153,39 +160,44 @@ def _of_ranges(monitor: Any, margin: float) -> Iterator[Limit]:
     for channel in spec.channels:
         part = spec.slices[channel.name]
         columns = range(*part.indices(spec.size))
-        has_peak = f"{channel.name}_peak" in spec.slices
         if channel.group == MOTOR:
             yield from _of_targets(channel, ranges, columns, margin)
-        elif has_peak or not kind_of(channel):
-            continue
-        elif kind_of(channel) == POSITION:
-            yield from _of_positions(channel, ranges, columns)
-        else:
-            for label, column in zip(channel.labels, columns, strict=True):
-                least, most = ranges[0, column], ranges[5, column]
-                bound = margin * max(abs(least), abs(most))
-                near = share_beyond(ranges, column, -NEAR * bound, NEAR * bound)
-                yield _symmetric(kind_of(channel), label, channel.unit, bound, (least, most), near)
+        elif f"{channel.name}_peak" not in spec.slices:
+            yield from _of_senses(channel, ranges, columns, margin)
 
 
-def _of_positions(channel: Channel, ranges: Floats, columns: range) -> Iterator[Limit]:
+def _of_senses(channel: Channel, ranges: Floats, columns: range, margin: float) -> Iterator[Limit]:
+    elements = channel.elements or ("",) * channel.size
     stops = channel.stops or ((-np.inf, np.inf),) * channel.size
-    for label, column, stop in zip(channel.labels, columns, stops, strict=True):
+    for n, column in enumerate(columns):
+        kind = kind_of(channel, elements[n])
+        label = channel.labels[n]
         least, most = float(ranges[0, column]), float(ranges[5, column])
-        room = RANGE_MARGIN * (most - least)
-        low = max(least - room, min(stop[0], least))
-        high = min(most + room, max(stop[1], most))
-        near = share_beyond(ranges, column, low + room, high - room)
-        yield Limit(
-            kind=POSITION,
-            label=label,
-            unit=channel.unit,
-            low=low,
-            high=high,
-            least=least,
-            most=most,
-            near=near,
-        )
+        if kind == POSITION:
+            yield _of_position(label, channel.unit, stops[n], ranges, column)
+        elif kind:
+            bound = margin * max(abs(least), abs(most))
+            near = share_beyond(ranges, column, -NEAR * bound, NEAR * bound)
+            yield _symmetric(kind, label, channel.unit, bound, (least, most), near)
+
+
+def _of_position(
+    label: str, unit: str, stops: tuple[float, float], ranges: Floats, column: int
+) -> Limit:
+    least, most = float(ranges[0, column]), float(ranges[5, column])
+    room = RANGE_MARGIN * (most - least)
+    low = max(least - room, min(stops[0], least))
+    high = min(most + room, max(stops[1], most))
+    return Limit(
+        kind=POSITION,
+        label=label,
+        unit=unit,
+        low=low,
+        high=high,
+        least=least,
+        most=most,
+        near=share_beyond(ranges, column, low + room, high - room),
+    )
 
 
 def _of_targets(channel: Channel, ranges: Floats, columns: range, margin: float) -> Iterator[Limit]:
