@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.reproduce import real_arms
-from asm_gym.scripts.reproduce.real_arms import (
+from asm_gym.scripts.reproduce import arm_recordings
+from asm_gym.scripts.reproduce.added_faults import (
     ADDED_FAULTS,
-    ARMS,
     NEWTONS,
-    SLIP,
-    Job,
     Piece,
-    examined,
     jacobian,
     with_fault,
 )
+from asm_gym.scripts.reproduce.arm_recordings import ARMS, SERVO_CHANNELS, SLIP_RAD
+from asm_gym.scripts.reproduce.real_arms import Job, examined, fault_result, split
 from tests.streams import pendulum_columns
 
 INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
@@ -34,8 +33,8 @@ PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIA
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with a recording of the UR10 alone, which has two joints here."""
-    monkeypatch.setattr(real_arms, "read_joint_states", lambda path: pendulum_columns(1500))
-    place = tmp_path / "arms" / ARMS["ur10"].bag
+    monkeypatch.setattr(arm_recordings, "read_joint_states", lambda path: pendulum_columns(1500))
+    place = tmp_path / "arms" / ARMS["ur10"].place
     place.parent.mkdir(parents=True)
     place.touch()
     (tmp_path / "arms" / "urdf").mkdir()
@@ -48,21 +47,18 @@ TWO_LINKS = BodyModel.of(PENDULUMS, ["position[0]", "position[1]"])
 
 def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     episode = Episode.from_table(pendulum_columns(200))
-    piece, rng, slices = (
-        Piece(episode, 100, np.array([5.0, 5.0]), None),
-        np.random.default_rng(0),
-        episode.spec.slices,
-    )
-    for kind in ("frozen", "slipped", "late", "step"):
+    piece = Piece(episode, 100, np.array([5.0, 5.0]), None, ARMS["ur10"])
+    rng = np.random.default_rng(0)
+    for kind in ("frozen", "slipped", "late", "step 20%", "step 10%"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
-        own = slices[ADDED_FAULTS[kind].column]
+        own = piece.columns(ADDED_FAULTS[kind].what)
         assert not changed[:100].any()
         assert changed[100:, own].any(axis=0).sum() == 1
         assert not np.delete(changed, np.arange(episode.spec.size)[own], axis=1).any()
         np.testing.assert_array_equal(found.faults, np.arange(200) >= 100)
     slid = with_fault("slipped", piece, rng).stream - episode.stream
-    assert np.abs(slid).max() == pytest.approx(SLIP, rel=1e-3)
+    assert np.abs(slid).max() == pytest.approx(SLIP_RAD, rel=1e-3)
     assert with_fault("push", piece, rng) is None  # motor currents say nothing of newtons
 
 
@@ -75,7 +71,8 @@ def test_a_push_does_the_work_of_its_force_at_the_outermost_link():
     )
     np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-12)
     episode = Episode.from_table(pendulum_columns(200))
-    found = with_fault("push", Piece(episode, 100, np.ones(2), TWO_LINKS), np.random.default_rng(0))
+    piece = Piece(episode, 100, np.ones(2), TWO_LINKS, ARMS["ur10"])
+    found = with_fault("push", piece, np.random.default_rng(0))
     torque = (found.stream - episode.stream)[-1, episode.spec.slices["effort"]].astype(float)
     along = jacobian(TWO_LINKS, episode.stream[-1, episode.spec.slices["position"]].astype(float))[
         0, 0
@@ -129,3 +126,68 @@ def test_every_monitor_meets_the_same_faults(folder):
     )
     assert one == other
     assert set(one) == {*ADDED_FAULTS, ""}
+
+
+def test_a_run_of_servos_is_cut_at_a_glitch_and_marked_rows_are_of_a_heated_servo(tmp_path):
+    rng = np.random.default_rng(0)
+    for run, faulty in (("20240101_000001", False), ("20240101_000002", True)):
+        folder = tmp_path / "matlab_ros_2024" / run
+        folder.mkdir(parents=True)
+        for motor in range(1, 7):
+            data = pd.DataFrame({name: rng.integers(100, 900, 400) for name in SERVO_CHANNELS})
+            data["label"] = 0
+            if motor == 3 and faulty:
+                data.loc[100:149, "label"] = 1
+            if motor == 5 and not faulty:
+                data.loc[200, "position"] = 4096 + 500
+            data.to_csv(folder / f"data_motor_{motor}.csv", index=False)
+    runs = arm_recordings.armpi_runs(tmp_path)
+    assert [len(run["position[0]"]) for run in runs.healthy] == [150, 149]
+    assert [int(run["label"].sum()) for run in runs.faulty["glitch"]] == [1]
+    assert [int(run["label"].sum()) for run in runs.faulty["heated"]] == [50]
+    assert max(run["position[4]"].max() for run in runs.healthy) < 1000
+
+
+def test_runs_of_hiro_hold_one_row_in_four_of_angles_force_and_torque(tmp_path):
+    t = np.arange(40)[:, None] / 200
+    for group, rows in (("success", 40), ("error", 32)):
+        folder = tmp_path / group / "run-01"
+        folder.mkdir(parents=True)
+        np.savetxt(folder / "R_Angles.dat", np.hstack([t[:rows], t[:rows] + np.arange(6)]))
+        np.savetxt(folder / "R_Torques.dat", np.hstack([t, 10 * t + np.arange(6)]), delimiter="\t")
+    runs = arm_recordings.hiro_runs(tmp_path)
+    good, failed = runs.healthy[0], runs.faulty["failed"][0]
+    np.testing.assert_allclose(good["position[2]"], t[::4, 0] + 2)
+    np.testing.assert_allclose(good["torque[1]"], 10 * t[::4, 0] + 4)
+    assert len(failed["force[0]"]) == 8  # of the shorter file
+
+
+def test_pieces_are_dealt_out_once_and_no_more_is_learned_than_asked_for(folder):
+    runs, _ = ARMS["ur10"].episodes(folder)
+    tested = []
+    for fold in range(4):
+        use = split(Job("ur10", "kalman", 0, fold), runs)
+        parts = [*use.learned, *use.calibration, *use.tested]
+        assert len({piece.stream.tobytes() for piece in parts}) == len(parts) == 15
+        tested += use.tested
+    assert len({piece.stream.tobytes() for piece in tested}) == 15
+    few = split(Job("ur10", "kalman", 0, 0), runs, minutes=3.01 / 60)
+    assert len(few.learned) == 3
+    assert len(few.tested) == 4
+
+
+def test_a_fault_is_found_only_after_its_onset_and_without_an_alarm_before():
+    class Unit:
+        threshold = 1.0
+
+    class Score:
+        def __init__(self, value):
+            self.value = np.array(value)
+
+    spec = Episode.from_table(pendulum_columns(5)).spec
+    is_faulty = np.array([False, False, False, True, True])
+    clip = Episode.from_stream(np.zeros((5, spec.size), np.float32), spec, faults=is_faulty)
+    found = fault_result(Unit(), "step", clip, Score([0, 0, 0.5, 0.9, 2]))
+    assert found["found"]
+    assert found["delay"] == pytest.approx(0.02)
+    assert not fault_result(Unit(), "step", clip, Score([0, 2, 0.5, 0.9, 2]))["found"]

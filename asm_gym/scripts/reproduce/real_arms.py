@@ -1,16 +1,15 @@
-"""What monitors find in recordings of real arms: faults added to them, and false alarms.
+"""What monitors find in recordings of real arms: faults added to them, labelled ones, and false alarms.
 
-The recordings are of others and lie in a folder; a missing one is named, with where it is published. Each is of an arm
-that did nothing wrong, cut into pieces. A quarter of them is tested, in turn; of the others two in three are learned
-from, and the greatest surprise of the rest is the threshold. Each tested piece is watched as it is, and with each fault
-from its middle on. Pieces are of one trajectory: no table says how a monitor fares on another.
-
-    push, payload    τ + Jᵀ F      J of the outermost link, by the arm's own URDF
+The recordings are of others and lie in a folder; a missing one is named, with where it is published. Runs in which the
+arm did nothing wrong are cut into pieces and dealt out at random. A quarter of the pieces is tested, in turn; of the
+others two in three are learned from, and the rest sets the threshold, for the fewest false alarms an hour that it can
+promise. Each tested piece is watched as it is, and a clip about its middle with each fault for a second. Pieces are of
+one robot and few programs: no table says how a monitor fares on other motion.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -21,19 +20,22 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode
 from asm_gym.data.training_selection import complete_parts, pieces
-from asm_gym.detection import alarms_in
+from asm_gym.detection.incidents import incidents_in, power_of
 from asm_gym.detection.scores import Largest
+from asm_gym.evaluation.statistics import Rate
 from asm_gym.evaluation.tables import Table
-from asm_gym.extras import require
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.monitors.torque.urdf import read_urdf
+from asm_gym.readings import spans
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.added_faults import ADDED_FAULTS, POSITION, Piece, with_fault
+from asm_gym.scripts.reproduce.arm_recordings import ARMS, RealArm
 from asm_gym.scripts.reproduce.kit import Findings, Record
 
 Floats = NDArray[np.float64]
@@ -41,192 +43,9 @@ Floats = NDArray[np.float64]
 RULE = "friction_rule"
 BODY = ", body"  # ends the name of a monitor that reads the arm's URDF
 WITH_BODY = tuple(name + BODY for name in ("neural_asm", "association_values", RULE))
-PIECE_S = 1.0  # length of a piece [s]
 FOLDS = 4  # of which one is tested at a time
-
-
-# ------------------------------------------------------------------ recordings
-
-
-class RealArm(NamedTuple):
-    """A recording of an arm that did nothing wrong, and its body model."""
-
-    robot: str
-    bag: str  # below the folder of all recordings
-    urdf: str  # file in the folder ``urdf`` of that of all recordings
-
-
-SOURCE = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-ARMS = {
-    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", "panda.urdf"),
-    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", "ur10_robot.urdf"),
-}
-
-
-def read_joint_states(path: Path) -> dict[str, NDArray[Any]]:
-    """Return time, position [rad], velocity and effort of each joint of a ROS 2 bag."""
-    return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
-
-
-def read_body(folder: Path, arm: RealArm) -> str:
-    """Return the text of an arm's URDF."""
-    path = folder / "urdf" / arm.urdf
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} is missing: it is in example-robot-data 6.0.0 (PyPI)")
-    return read_urdf(path)
-
-
-class Piece(NamedTuple):
-    """A piece of a recording, and where a fault in it begins."""
-
-    episode: Episode
-    onset: int  # row
-    ranges: Floats  # (J,) of each effort in the whole recording
-    body: BodyModel | None  # of an arm with torques in N m
-
-    def column(self, name: str) -> Floats:
-        """Return position or effort (T, J)."""
-        return self.episode.stream[:, self.episode.spec.slices[name]].astype(np.float64)
-
-    def rise(self) -> Floats:
-        """Return the share (T - onset,) of its size that a growing fault has reached."""
-        rows = np.arange(len(self.episode) - self.onset)
-        since = (1 + rows) * self.episode.spec.dt  # [s]
-        return np.minimum(1.0, since / RISE_S)
-
-    def strong_joint(self, rng: np.random.Generator) -> int:
-        """Draw one of the joints whose effort ranges far."""
-        strong = np.flatnonzero(self.ranges > 0.1 * self.ranges.max())
-        return int(rng.choice(strong))
-
-    def at_joint(self, joint: int, values: Floats | float) -> Floats:
-        """Return (T - onset, J): ``values`` (T - onset,) at one joint, 0 at the others."""
-        rows = len(self.episode) - self.onset
-        added = np.zeros((rows, len(self.ranges)))
-        added[:, joint] = values
-        return added
-
-    def torques(self, force: Sequence[float]) -> Floats:
-        """Return the torques (T - onset, J) of a growing force (3,) [N] at the outermost link."""
-        assert self.body is not None
-        angles = self.column("position")[self.onset :]
-        torques = [jacobian(self.body, q).T @ np.array(force) for q in angles]
-        return np.array(torques) * self.rise()[:, None]
-
-
-# ------------------------------------------------------------------ faults added to recordings
-
-NEWTONS = 20.0  # push at the hand
-GRAVITY = 9.81  # weight of a payload of 1 kg [N]
-STEP_SHARE = 0.2  # step of a joint's effort, in its range
-SLIP = 0.05  # of an encoder [rad]
-LATE_S = 0.1  # delay of an effort [s]
-RISE_S = 0.1  # time in which a force grows [s]
-MOVES = 0.02  # least angle of motion after the onset that shows a frozen encoder [rad]
-
-
-def jacobian(body: BodyModel, q: Floats) -> Floats:
-    """Return the velocity of the outermost link [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
-    mujoco: Any = require("mujoco", what="a push at a hand")
-    model = body.model
-    data = mujoco.MjData(model)
-    data.qpos[:] = q[body.columns]
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    depth = np.zeros(model.nbody)
-    for link in range(1, model.nbody):  # parents come first
-        depth[link] = depth[model.body_parentid[link]] + 1
-    outermost = int(depth.argmax())
-    by_column = np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, by_column, None, outermost)
-    by_joint = np.zeros((3, len(q)))
-    by_joint[:, body.columns] = by_column
-    return by_joint
-
-
-def push(piece: Piece, rng: np.random.Generator) -> Floats:
-    """Push the hand sideways."""
-    angle = rng.uniform(0, 2 * np.pi)
-    force = [NEWTONS * np.cos(angle), NEWTONS * np.sin(angle), 0.0]
-    return piece.torques(force)
-
-
-def payload(piece: Piece, rng: np.random.Generator) -> Floats:
-    """Hang 1 kg on the hand."""
-    return piece.torques([0.0, 0.0, -GRAVITY])
-
-
-def step(piece: Piece, rng: np.random.Generator) -> Floats:
-    """Shift the effort of a joint."""
-    joint = piece.strong_joint(rng)
-    sign = rng.choice([-1, 1])
-    size = sign * STEP_SHARE * piece.ranges[joint]
-    return piece.at_joint(joint, size * piece.rise())
-
-
-def freeze(piece: Piece, rng: np.random.Generator) -> Floats | None:
-    """Freeze the encoder of a joint that moves; None where none does."""
-    angles = piece.column("position")
-    after = angles[piece.onset :]
-    moving = np.flatnonzero(np.ptp(after, axis=0) > MOVES)
-    if not len(moving):
-        return None
-    joint = int(rng.choice(moving))
-    frozen = angles[piece.onset - 1, joint]
-    return piece.at_joint(joint, frozen - after[:, joint])
-
-
-def slip(piece: Piece, rng: np.random.Generator) -> Floats:
-    """Let an encoder slip."""
-    angle = rng.choice([-1, 1]) * SLIP
-    joint = int(rng.integers(len(piece.ranges)))
-    return piece.at_joint(joint, angle)
-
-
-def delay(piece: Piece, rng: np.random.Generator) -> Floats:
-    """Delay the effort of a joint."""
-    joint = piece.strong_joint(rng)
-    effort = piece.column("effort")[:, joint]
-    rows = max(1, round(LATE_S / piece.episode.spec.dt))
-    late = effort[piece.onset - rows : len(effort) - rows]
-    return piece.at_joint(joint, late - effort[piece.onset :])
-
-
-class Fault(NamedTuple):
-    """A fault that is added to a recording; none of them happened, as every table says."""
-
-    column: str  # "position" or "effort"
-    added: Callable[[Piece, np.random.Generator], Floats | None]  # (T - onset, J) from the onset on
-    needs_body: bool = False
-
-
-ADDED_FAULTS = {
-    "push": Fault("effort", push, needs_body=True),
-    "payload": Fault("effort", payload, needs_body=True),
-    "step": Fault("effort", step),
-    "frozen": Fault("position", freeze),
-    "slipped": Fault("position", slip),
-    "late": Fault("effort", delay),
-}
-
-
-def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
-    """Return the piece with a fault from the onset on; None where the piece does not allow it."""
-    fault = ADDED_FAULTS[kind]
-    if fault.needs_body and piece.body is None:
-        return None
-    added = fault.added(piece, rng)
-    if added is None:
-        return None
-    spec = piece.episode.spec
-    columns = spec.slices[fault.column]
-    stream = piece.episode.stream.copy()
-    stream[piece.onset :, columns] += added.astype(np.float32)
-    is_faulty = np.arange(len(stream)) >= piece.onset
-    return Episode.from_stream(stream, spec, faults=is_faulty)
-
-
-# ------------------------------------------------------------------ the study
+BEFORE_S = 3.0  # of a clip before the fault [s]
+FAULT_S = 1.0  # length of a fault [s]
 
 
 @dataclass(frozen=True)
@@ -240,19 +59,14 @@ class Config(kit.Config):
     experiments: tuple[str, ...] = option(tuple(ARMS), quick=("panda",), least=1, known=ARMS)
     """Recordings; missing ones are left out, and named."""
     monitors: tuple[str, ...] = option(
-        (
-            "neural_asm",
-            "association_values",
-            "association_linear+evidence",
-            "kalman+evidence",
-            "gru+evidence",
-            RULE,
-        ),
+        ("neural_asm", "association_values", RULE, "gru", "kalman"),
         quick=("association_values", RULE),
         least=1,
         known=(*MONITORS, *WITH_BODY, RULE),
     )
     """Monitors; those named with a body read the arm's URDF."""
+    minutes: float = option(0.0)
+    """Most minutes to learn from; 0 for all that there are."""
 
 
 class Job(NamedTuple):
@@ -269,17 +83,17 @@ def run(config: Config) -> Findings:
     present = []
     missing = []
     for name in config.experiments:
-        path = config.folder / ARMS[name].bag
+        path = config.folder / ARMS[name].place
         if path.exists():
             present.append(name)
         else:
-            missing.append(f"{path} is missing: it is {SOURCE}")
+            missing.append(f"{path} is missing: it is {ARMS[name].source}")
     if not present:
         raise FileNotFoundError("; ".join(missing))
 
     grid = product(present, config.monitors, config.repetitions, range(FOLDS))
-    jobs = [Job._make(one) for one in grid]
-    work = partial(examined, folder=config.folder)
+    jobs = [job for job in map(Job._make, grid) if is_possible(job)]
+    work = partial(examined, folder=config.folder, minutes=config.minutes)
     records = kit.records_of("watching", work, jobs, config)
     tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
     left_out = "".join(f" Left out: {reason}." for reason in missing)
@@ -287,97 +101,174 @@ def run(config: Config) -> Findings:
     return Findings(records, tables)
 
 
+def is_possible(job: Job) -> bool:
+    """Return whether the arm senses what the monitor needs."""
+    arm = ARMS[job.experiment]
+    if job.monitor in WITH_BODY and not arm.urdf:
+        return False
+    return arm.has_joint_torques or not job.monitor.startswith(RULE)
+
+
 class Split(NamedTuple):
-    """Pieces of a recording by their use."""
+    """Pieces of recordings by their use."""
 
     learned: list[Episode]
     calibration: list[Episode]
     tested: list[Episode]
 
 
-def split(job: Job, whole: Episode) -> Split:
-    """Cut a recording into pieces, and deal them out for one fold."""
-    cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
+def split(job: Job, runs: Sequence[Episode], minutes: float = 0.0) -> Split:
+    """Cut runs into pieces, and deal them out for one fold."""
+    parts = [part for whole in runs for part in complete_parts(whole)]
+    cut = parts
+    piece_s = ARMS[job.experiment].piece_s
+    if np.isfinite(piece_s):
+        cut = [piece for part in parts for piece in pieces(part, piece_s)]
     order = np.random.default_rng(job.seed).permutation(len(cut))
     is_tested = np.arange(len(cut)) % FOLDS == job.fold
     tested = np.sort(order[is_tested])
     others = order[~is_tested]
     if len(others) < 4:
-        raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
+        raise ValueError(f"{job.experiment} has {len(cut)} pieces of {piece_s:g} s: too few")
     is_learned = np.arange(len(others)) % 3 > 0
+    learned = [cut[i] for i in others[is_learned]]
+    if minutes:
+        ends = np.cumsum([minutes_of([piece]) for piece in learned])
+        learned = learned[: max(1, int((ends <= minutes).sum()))]
     return Split(
-        learned=[cut[i] for i in others[is_learned]],
+        learned=learned,
         calibration=[cut[i] for i in others[~is_learned]],
         tested=[cut[i] for i in tested],
     )
 
 
-def examined(job: Job, folder: Path) -> list[Record]:
-    """Return a record for each tested piece as it is, and for each fault in it."""
+def minutes_of(episodes: Sequence[Episode]) -> float:
+    """Return the length of episodes [min]."""
+    return sum(len(episode) * episode.spec.dt for episode in episodes) / 60
+
+
+def read_body(folder: Path, arm: RealArm) -> str:
+    """Return the text of an arm's URDF; empty where the arm has none."""
+    if not arm.urdf:
+        return ""
+    path = folder / "urdf" / arm.urdf
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing: it is in example-robot-data 6.0.0 (PyPI)")
+    return read_urdf(path)
+
+
+def examined(job: Job, folder: Path, minutes: float = 0.0) -> list[Record]:
+    """Return a record for each tested piece as it is, for each fault in it, and for each labelled fault."""
     arm = ARMS[job.experiment]
-    whole = Episode.from_table(read_joint_states(folder / arm.bag), success=True)
-    spec = whole.spec
-    use = split(job, whole)
+    runs, labelled = arm.episodes(folder)
+    use = split(job, runs, minutes)
     urdf = read_body(folder, arm)
     monitor = fitted(job, use.learned, urdf)
-    rate = 1.0 / (len(use.calibration) + 1)
-    threshold = monitor.calibrate(use.calibration, rate).threshold
+    promised = 60.0 / minutes_of(use.calibration)  # the fewest that it can promise [1/h]
+    monitor.calibrate(use.calibration, false_alarms_per_hour=promised * (1 + 1e-9))
+    about = {**job._asdict(), "learned_min": minutes_of(use.learned), "promised": promised}
 
-    effort = whole.stream[:, spec.slices["effort"]].astype(np.float64)
-    low, high = np.quantile(effort, (0.05, 0.95), axis=0)
-    body = BodyModel.of(urdf, spec.labels[spec.slices["position"]])
-    rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
-    kinds = [""] * len(use.tested)
-    episodes = [*use.tested]
-    for episode, kind in product(use.tested, ADDED_FAULTS):
-        piece = Piece(episode, onset=len(episode) // 2, ranges=high - low, body=body)
-        faulty = with_fault(kind, piece, rng)
-        if faulty is not None:
-            kinds.append(kind)
-            episodes.append(faulty)
-    records = []
-    for kind, score in zip(kinds, monitor.score_episodes(episodes), strict=True):
-        result = result_of(kind, score.value / threshold, spec.dt)
-        records.append(job._asdict() | result)
+    scores = monitor.score_episodes(use.tested)
+    records = [about | healthy_result(monitor, score) for score in scores]
+    kinds, clips = faulty_clips(job, arm, use.tested, urdf)
+    for kind, clip, score in zip(kinds, clips, monitor.score_episodes(clips), strict=True):
+        records.append(about | fault_result(monitor, kind, clip, score))
+    if job.fold == 0:
+        for kind, episodes in labelled.items():
+            for episode, score in zip(episodes, monitor.score_episodes(episodes), strict=True):
+                records += [about | one for one in labelled_results(monitor, kind, episode, score)]
     return records
 
 
-def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
+def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> CalibratedMonitor:
     """Return the monitor of a job, fitted; one that is named with a body reads the text of ``urdf``."""
     spec = episodes[0].spec
     name = job.monitor.removesuffix(BODY)
     settings: dict[str, Any] = {}
-    if name == "neural_asm":
-        settings["values"] = True  # as ``asm-gym fit`` fits a log
     if job.monitor in WITH_BODY:
         settings["urdf"] = urdf
     if name == RULE:
         rule = FrictionRule(spec, **settings)
-        monitor: Any = CalibratedMonitor(rule, Largest(spec), seed=job.seed)
-    else:
-        monitor = make_monitor(name, spec, seed=job.seed, **settings)
-    return monitor.fit(list(episodes))
+        return CalibratedMonitor(rule, Largest(spec), seed=job.seed).fit(list(episodes))
+    return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
 
 
-def result_of(kind: str, surprise: Floats, dt: float) -> Record:
-    """Return the result of a piece, by its surprise (T,) [thresholds]; a fault begins in its middle."""
-    is_over = surprise > 1
-    if not kind:
-        return {
-            "kind": kind,
-            "alarms": alarms_in(surprise, 1.0, dt),
-            "alarm_s": is_over.sum() * dt,
-            "seconds": len(surprise) * dt,
-            "excess": float(surprise.max()),
-        }
-    onset = len(surprise) // 2
-    rows_over = np.flatnonzero(is_over[onset:])
-    found = bool(len(rows_over)) and not is_over[:onset].any()
+def faulty_clips(
+    job: Job, arm: RealArm, tested: Sequence[Episode], urdf: str
+) -> tuple[list[str], list[Episode]]:
+    """Return kinds of faults, and a clip with each."""
+    spec = tested[0].spec
+    body = None
+    if urdf:
+        body = BodyModel.of(urdf, spec.labels[spec.slices[POSITION]])
+    ranges = np.zeros(0)
+    if arm.efforts:
+        effort = np.concatenate([episode.stream for episode in tested]).astype(np.float64)
+        columns = Piece(tested[0], 0, ranges=ranges, body=None, arm=arm).columns("effort")
+        low, high = np.quantile(effort[:, columns], (0.05, 0.95), axis=0)
+        ranges = high - low
+    rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
+    kinds = []
+    clips = []
+    for episode, kind in product(tested, ADDED_FAULTS):
+        clip, onset = clip_of(episode)
+        piece = Piece(clip, onset, ranges=ranges, body=body, arm=arm)
+        faulty = with_fault(kind, piece, rng)
+        if faulty is not None:
+            kinds.append(kind)
+            clips.append(faulty)
+    return kinds, clips
+
+
+def clip_of(episode: Episode) -> tuple[Episode, int]:
+    """Return the rows about the middle of a piece, and the row among them in which a fault begins."""
+    dt = episode.spec.dt
+    middle = len(episode) // 2
+    start = max(0, middle - round(BEFORE_S / dt))
+    rows = episode.stream[start : middle + round(FAULT_S / dt)]
+    return Episode.from_stream(rows, episode.spec, success=True), middle - start
+
+
+def healthy_result(monitor: CalibratedMonitor, score: Surprise) -> Record:
+    """Return how many alarms a healthy piece raises, and its largest surprise [thresholds]."""
+    threshold = monitor.threshold
+    dt = monitor.spec.dt
+    shares_of = score.attribution.__getitem__
+    alarms = incidents_in(score.value, threshold, dt, shares_of, power_of(monitor))
+    return {
+        "kind": "",
+        "alarms": alarms,
+        "alarm_s": (score.value > threshold).sum() * dt,
+        "seconds": len(score.value) * dt,
+        "excess": float(score.value.max() / threshold),
+    }
+
+
+def fault_result(monitor: CalibratedMonitor, kind: str, clip: Episode, score: Surprise) -> Record:
+    """Return whether a fault was found, after which delay [s], and its largest surprise [thresholds]."""
+    surprise = score.value / monitor.threshold
+    onset = int(clip.faults.argmax())
+    rows_over = np.flatnonzero(surprise[onset:] > 1)
+    found = bool(len(rows_over)) and not (surprise[:onset] > 1).any()
     delay = np.nan
     if found:
-        delay = dt * (rows_over[0] + 1)
+        delay = clip.spec.dt * (rows_over[0] + 1)
     excess = float(surprise[onset:].max())
-    return {"kind": kind, "found": found, "delay": delay, "excess": excess}
+    return {"kind": kind, "added": True, "found": found, "delay": delay, "excess": excess}
+
+
+def labelled_results(
+    monitor: CalibratedMonitor, kind: str, episode: Episode, score: Surprise
+) -> list[Record]:
+    """Return whether each labelled stretch of a run was found; a run without a label is one stretch."""
+    is_faulty = np.ones(len(episode), bool)
+    if episode.faults.any():
+        is_faulty = episode.faults
+    records = []
+    for start, stop in spans(is_faulty):
+        excess = float(score.value[start:stop].max() / monitor.threshold)
+        records.append({"kind": kind, "added": False, "found": excess > 1, "excess": excess})
+    return records
 
 
 def table(records: pd.DataFrame, arm: RealArm) -> Table:
@@ -388,10 +279,9 @@ def table(records: pd.DataFrame, arm: RealArm) -> Table:
     fewest = int(pieces_over.min())
     seconds = healthy.seconds.sum() / len(monitors)
     caption = (
-        f"{arm.robot} ({arm.bag}), {seconds:.0f} s as recorded. "
-        "* added to the recording, found within half a piece. "
-        f"At {fewest}: pushes and payloads found by the threshold "
-        f"that {fewest} healthy pieces pass."
+        f"{arm.robot} ({arm.place}), {seconds / 60:.1f} min as recorded, learned from "
+        f"{healthy.learned_min.mean():.1f} min. * added to the recording, found within a second. "
+        f"At {fewest}: faults found by the threshold that {fewest} healthy pieces pass."
     )
     return kit.table_of(caption, [monitor_row(name, own, fewest) for name, own in monitors])
 
@@ -401,21 +291,22 @@ def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]
 
     Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass.
     """
-    row = {"Monitor": name}
-    for kind in ADDED_FAULTS:
-        faulty = records[records.kind == kind]
-        if len(faulty):
-            row[f"{kind} *"] = f"{faulty.found.astype(int).sum()} of {len(faulty)}"
+    healthy = records[records.kind == ""]
+    faulty = records[records.kind != ""]
+    row = {
+        "Monitor": name,
+        "promised [1/h]": f"{healthy.promised.mean():.0f}",
+        "raised [1/h]": Rate(int(healthy.alarms.sum()), healthy.seconds.sum() / 3600).text,
+    }
+    for kind, own in faulty.groupby("kind", sort=False):
+        star = " *" if own.added.all() else ""
+        row[f"{kind}{star}"] = f"{own.found.astype(int).sum()} of {len(own)}"
     row["delay [s]"] = ""
     if records.delay.notna().any():
         row["delay [s]"] = f"{records.delay.median():.3g}"
 
-    healthy = records[records.kind == ""]
-    pushed = records[records.kind.isin(["push", "payload"])]
+    added = faulty[faulty.added.astype(bool)]
     comparable_threshold = healthy.excess.nlargest(fewest + 1).iloc[-1]
-    is_found = pushed.excess > comparable_threshold
-    row[f"at {fewest}"] = f"{is_found.sum()} of {len(pushed)}"
-    seconds = healthy.seconds.sum()
-    row["false alarms an hour"] = f"{3600 * healthy.alarms.sum() / seconds:.0f}"
-    row["healthy time in alarm"] = f"{100 * healthy.alarm_s.sum() / seconds:.1f} %"
+    row[f"at {fewest}"] = f"{(added.excess > comparable_threshold).sum()} of {len(added)}"
+    row["time in alarm"] = f"{100 * healthy.alarm_s.sum() / healthy.seconds.sum():.1f} %"
     return row

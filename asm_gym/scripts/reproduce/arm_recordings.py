@@ -1,0 +1,236 @@
+"""Read the recordings of real arms that the study ``real_arms`` uses, from a folder of the user.
+
+A set holds runs in which the arm did nothing wrong, and perhaps runs with faults that were labelled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scipy.io
+from numpy.typing import NDArray
+
+from asm_gym.data.bags import read_bag
+from asm_gym.data.episode import Episode
+from asm_gym.readings import spans
+
+Columns = dict[str, NDArray[Any]]
+
+SLIP_RAD = 0.05  # of an encoder [rad]
+SERVO_UNITS = 1000  # highest position of a bus servo, that is 240°; readings beyond it are glitches
+GLITCH_ROWS = 50  # of a run before and after a glitch that are watched
+UNMARKED_FAILURE = "20240325_155003"
+HIRO_EVERY = 4  # rows of HIRO of which one is read: 50 of 200 a second
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs of an arm as tables of columns."""
+
+    healthy: list[Columns]
+    faulty: dict[str, list[Columns]] = field(default_factory=dict)
+    """By kind; a column ``label`` marks the rows with the fault, otherwise all have it."""
+
+
+@dataclass(frozen=True)
+class RealArm:
+    """A set of recordings of an arm."""
+
+    robot: str
+    place: str  # below the folder of all recordings
+    source: str
+    read: Callable[[Path], Runs]
+    piece_s: float
+    """Length of the pieces that are dealt out [s]; runs are no longer than ``inf``."""
+    rate: float | None = None  # of the rows [Hz]; by default from their clock
+    urdf: str = ""  # file in the folder ``urdf`` of that of all recordings; empty without
+    efforts: tuple[str, ...] = (
+        "effort",
+    )  # channels of torques, or of force and torque at the wrist
+    slip: float = SLIP_RAD  # of an encoder, in units of its position
+    has_joint_torques: bool = True
+
+    def episodes(self, folder: Path) -> tuple[list[Episode], dict[str, list[Episode]]]:
+        """Return the healthy runs as episodes, and those with faults by their kind."""
+        runs = self.read(folder / self.place)
+        kinds = [kind for kind, tables in runs.faulty.items() for _ in tables]
+        faulty = [table for tables in runs.faulty.values() for table in tables]
+        tables = [*runs.healthy, *faulty]
+        episodes = Episode.from_tables(tables, rate=self.rate, labels=("label",), success=True)
+        count = len(runs.healthy)
+        by_kind: dict[str, list[Episode]] = {kind: [] for kind in kinds}
+        for kind, episode in zip(kinds, episodes[count:], strict=True):
+            by_kind[kind].append(episode)
+        return episodes[:count], by_kind
+
+
+def read_joint_states(path: Path) -> Columns:
+    """Return time, position [rad], velocity and effort of each joint of a ROS bag."""
+    return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
+
+
+def one_bag(path: Path) -> Runs:
+    """Read one healthy run."""
+    return Runs([read_joint_states(path)])
+
+
+def numbered(**channels: NDArray[Any]) -> Columns:
+    """Return a column for each number of channels (T, N), as ``position[0]``."""
+    columns = {}
+    for name, values in channels.items():
+        columns |= {f"{name}[{n}]": column for n, column in enumerate(values.T)}
+    return columns
+
+
+def ur3_bags(folder: Path) -> Runs:
+    """Read seven bags of a UR3, of which one repeats another: position, velocity and effort."""
+    runs = []
+    for path in sorted(folder.glob("*.bag")):
+        if "21-04-09" in path.name:
+            continue
+        bag = read_bag(path)
+        channels = {}
+        for name in ("position", "velocity", "effort"):
+            joints = [values for key, values in bag.items() if f".{name}[" in key]
+            channels[name] = np.stack(joints, axis=1)
+        runs.append(numbered(**channels))
+    return Runs(runs)
+
+
+def weigand_mats(folder: Path) -> Runs:
+    """Read three runs of an industrial arm: angle and speed of the motors, and their torque."""
+    runs = []
+    for path in sorted(folder.glob("FF_*.mat")):
+        loaded = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
+        record = loaded["rec"]
+        run = numbered(
+            position=np.deg2rad(record.act_pos_mot_deg.T),
+            velocity=np.deg2rad(record.act_vel_mot_deg_per_s.T),
+            effort=record.act_torque_abs_nm.T,
+        )
+        runs.append(run)
+    return Runs(runs)
+
+
+def hiro_runs(folder: Path) -> Runs:
+    """Read good and failed snap assemblies: angles, and force and torque at the wrist."""
+
+    def run(path: Path) -> Columns:
+        angles = _numbers(path / "R_Angles.dat")
+        wrench = _numbers(path / "R_Torques.dat")
+        rows = slice(0, min(len(angles), len(wrench)), HIRO_EVERY)
+        force = wrench[rows, 1:4]
+        return numbered(position=angles[rows, 1:], force=force, torque=wrench[rows, 4:])
+
+    good = [run(path.parent) for path in sorted(folder.glob("success/*/R_Angles.dat"))]
+    failed = [run(path.parent) for path in sorted(folder.glob("error/*/R_Angles.dat"))]
+    return Runs(good, {"failed": failed})
+
+
+def _numbers(path: Path) -> NDArray[np.float64]:
+    """Return the numbers (T, N) of a file without headings."""
+    return pd.read_csv(path, sep=r"\s+", header=None).to_numpy(np.float64)
+
+
+def armpi_runs(folder: Path) -> Runs:
+    """Read runs of six bus servos; those with marked rows have a heated servo.
+
+    Healthy runs are cut where a reading is a glitch, and each glitch is a run of a few seconds. A run that its
+    authors list as failing, and in which no row is marked, is of neither kind.
+    """
+    healthy = []
+    heated = []
+    glitches = []
+    for path in sorted(folder.glob("matlab_ros_2024/*")):
+        if path.name == UNMARKED_FAILURE:
+            continue
+        motors = [pd.read_csv(path / f"data_motor_{n}.csv") for n in range(1, 7)]
+        run = numbered(**{name: _side_by_side(motors, name) for name in SERVO_CHANNELS})
+        is_heated = _side_by_side(motors, "label").any(axis=1)
+        if is_heated.any():
+            heated.append({**run, "label": is_heated})
+            continue
+        position = _side_by_side(motors, "position")
+        is_glitch = ((position < 0) | (position > SERVO_UNITS)).any(axis=1)
+        window = np.ones(2 * GLITCH_ROWS + 1)
+        is_near = np.convolve(is_glitch, window, "same") > 0
+        labelled = {**run, "label": is_glitch}
+        glitches += [_rows(labelled, *span) for span in spans(is_near)]
+        healthy += [_rows(run, *span) for span in spans(~is_near)]
+    return Runs(healthy, {"heated": heated, "glitch": glitches})
+
+
+def _rows(run: Columns, start: int, stop: int) -> Columns:
+    return {name: values[start:stop] for name, values in run.items()}
+
+
+SERVO_CHANNELS = ("position", "temperature", "voltage")
+
+
+def _side_by_side(motors: Iterable[pd.DataFrame], name: str) -> NDArray[np.float64]:
+    return np.stack([motor[name].to_numpy(np.float64) for motor in motors], axis=1)
+
+
+SECONDS = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
+ARMS = {
+    "panda": RealArm(
+        robot="Franka Panda",
+        place="unisa_acg/panda_exciting_trajectory.db3",
+        source=SECONDS,
+        read=one_bag,
+        piece_s=1.0,
+        urdf="panda.urdf",
+    ),
+    "ur10": RealArm(
+        robot="UR10",
+        place="unisa_acg/ur10_exciting_trajectory.db3",
+        source=SECONDS,
+        read=one_bag,
+        piece_s=1.0,
+        urdf="ur10_robot.urdf",
+    ),
+    "weigand": RealArm(
+        robot="6-axis industrial arm",
+        place="weigand_10s",
+        source="JonasWeigand/Robot_Identification @ 9e403c07 (MIT)",
+        read=weigand_mats,
+        piece_s=1.0,
+        rate=250.0,
+    ),
+    "ur3": RealArm(
+        robot="UR3",
+        place="ur3_aspectum",
+        source="aspectum/ur3-force-estimation @ 36685d83 (MIT)",
+        read=ur3_bags,
+        piece_s=4.0,
+        rate=125.0,
+        urdf="ur3_robot.urdf",
+    ),
+    "hiro": RealArm(
+        robot="Kawada HIRO",
+        place="hiro_snap_assembly",
+        source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
+        read=hiro_runs,
+        piece_s=np.inf,
+        rate=50.0,
+        efforts=("force", "torque"),
+        has_joint_torques=False,
+    ),
+    "armpi": RealArm(
+        robot="ArmPi FPV",
+        place="armpi_fpv_faults",
+        source="sonic160/digital_twin_robot @ 7074bd5f (MIT)",
+        read=armpi_runs,
+        piece_s=30.0,
+        rate=10.0,
+        efforts=(),
+        slip=SLIP_RAD * SERVO_UNITS / np.deg2rad(240),
+        has_joint_torques=False,
+    ),
+}
+"""Sets by name; the first three are of seconds, the others of minutes."""
