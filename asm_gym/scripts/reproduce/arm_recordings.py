@@ -81,7 +81,7 @@ def one_bag(path: Path) -> Runs:
 
 def numbered(**channels: NDArray[Any]) -> Columns:
     """Return a column for each number of channels (T, N), as ``position[0]``."""
-    columns = {}
+    columns: Columns = {}
     for name, values in channels.items():
         columns |= {f"{name}[{n}]": column for n, column in enumerate(values.T)}
     return columns
@@ -143,20 +143,20 @@ def armpi_runs(folder: Path) -> Runs:
     Healthy runs are cut where a reading is a glitch, and each glitch is a run of a few seconds. A run that its
     authors list as failing, and in which no row is marked, is of neither kind.
     """
-    healthy = []
-    heated = []
-    glitches = []
+    healthy: list[Columns] = []
+    heated: list[Columns] = []
+    glitches: list[Columns] = []
     for path in sorted(folder.glob("matlab_ros_2024/*")):
         if path.name == UNMARKED_FAILURE:
             continue
         motors = [pd.read_csv(path / f"data_motor_{n}.csv") for n in range(1, 7)]
         run = numbered(**{name: _side_by_side(motors, name) for name in SERVO_CHANNELS})
-        is_heated = _side_by_side(motors, "label").any(axis=1)
+        is_heated = np.asarray(_side_by_side(motors, "label").any(axis=1))
         if is_heated.any():
             heated.append({**run, "label": is_heated})
             continue
         position = _side_by_side(motors, "position")
-        is_glitch = ((position < 0) | (position > SERVO_UNITS)).any(axis=1)
+        is_glitch = np.asarray(((position < 0) | (position > SERVO_UNITS)).any(axis=1))
         window = np.ones(2 * GLITCH_ROWS + 1)
         is_near = np.convolve(is_glitch, window, "same") > 0
         labelled = {**run, "label": is_glitch}
