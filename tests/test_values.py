@@ -70,9 +70,8 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
         running_mean(np.array(left), 10), np.array(expected) * model.learned_["largest"], atol=1e-12
     )
     most = [np.abs(o.errors).max(axis=0) for o in model_outputs(model, cut[:20])]
-    assert (
-        np.max(most, axis=0) < 1.0
-    ).all()  # rows that it has learned from: cross-fitted ones err more
+    # The largest cross-fitted error is about that of rows that it has learned from.
+    assert (np.max(most, axis=0) < 1.1).all()
 
 
 @given(

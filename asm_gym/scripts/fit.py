@@ -32,6 +32,7 @@ from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.monitor_registry import check_monitor_name
+from asm_gym.monitors.sight import LASTS_S, MOST, sights
 from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.monitors.training_data import mute_channels
@@ -365,6 +366,9 @@ def fit(args: Args, console: Console) -> int:
         say(f"Left out: {left_out}.")
     for line in chain(notes_on_parts, summary_of_threshold(args, monitor, len(calibration))):
         say(line)
+    if not args.quick:
+        for line in summary_of_sight(monitor, calibration):
+            say(line)
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Next: asm-gym watch LOG --monitor {args.out}")
     return exit_code_of_reading(notes)
@@ -402,6 +406,25 @@ def summary_of_threshold(args: Args, monitor: Any, calibration_episodes: int) ->
     if expected > 1.0:
         line += f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
     yield line
+
+
+def summary_of_sight(monitor: CalibratedMonitor, calibration: list[Episode]) -> Iterator[str]:
+    """Yield how large errors of torques and positions are seen at the threshold."""
+    seen = []
+    unseen = []
+    for sight in sights(monitor, calibration):
+        if sight.size < np.inf:
+            unit = f" {sight.unit}" if sight.unit != "1" else ""
+            seen.append(f"{sight.label} {sight.size:.2g}{unit} ({sight.share:.0%} of its range)")
+        else:
+            unseen.append(sight.label)
+    if seen:
+        yield (
+            f"Sees, in {MOST:.0%} of places, an error that lasts {LASTS_S:g} s, "
+            f"from this size on: {', '.join(seen)}."
+        )
+    if unseen:
+        yield f"Does not see half of the range: {', '.join(unseen)}; record more motion."
 
 
 main = partial(run, "fit", Args, fit)

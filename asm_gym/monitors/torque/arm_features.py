@@ -2,7 +2,7 @@
 
     tanh(v/w s)       w ∈ {0.01, 0.1, 1}, of each speed v of spread s
     sin, cos          of angles q, of q_2 + q_3, …, and products of two of them
-    g, M q̈ + c        what the links weigh on each joint, by a body model in place of the sines (``body_model``)
+    g, M q̈ + c        what the links weigh on each joint, by a body model (``body_model``)
 
 Motor current is torque plus what the sign of the speed says, and weight is a sum of products of sines of angles along
 the chain: a linear model can say neither without. Source: Stribeck friction smoothed by tanh: Makkar et al. 2005.
@@ -53,7 +53,7 @@ class ArmFeatures:
         angles: (J,) senses that are angles, along the chain.
         from_changes: speeds are changes of positions.
         radians: (J,) each angle's unit [rad].
-        body: replaces the sines; None without a body model.
+        body: stands beside the sines; None without a body model.
     """
 
     senses: int
@@ -104,7 +104,6 @@ class ArmFeatures:
             of_weight = of_angle.any(axis=0)
             of_motion = of_weight | of_speed.any(axis=0)
             parts += [of_weight] * joints + [of_motion] * joints
-            return np.vstack(parts)
 
         of_single = np.vstack([of_angle, of_angle])
         last = min(joints, LONGEST_SUM + 1)
@@ -127,7 +126,7 @@ class ArmFeatures:
         parts = [np.tanh(speed / width) for width in WIDTHS]
         if self.body is not None:
             parts += self.body.torques(self.motion(rows))
-        elif len(self.angles):
+        if len(self.angles):
             parts += self._weight(rows.values[:, self.angles] * self.radians)
         return np.hstack(parts)
 

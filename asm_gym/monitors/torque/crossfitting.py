@@ -25,6 +25,7 @@ CROSSFIT_FOLDS = 5
 ALL_ROWS = CROSSFIT_FOLDS  # index of the equations of all rows, after those without each fold
 RIDGE_PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # λ, of standardised inputs
 STIFFNESS = 1e-3  # λ_h
+WORTHWHILE = 0.5  # share of an arm's squared error below which all inputs predict a torque instead
 LEAST_REMAINDER = 1e-4  # of what is left of a standardised number
 
 
@@ -82,10 +83,9 @@ class FoldEquations:
             errors[rows] -= inputs @ self.weights(fold, used, targets, penalty)
         return errors
 
-    def leverage(self, withheld: Places) -> Leverage:
-        """Return the leverage of rows by all inputs but those ``withheld``."""
+    def leverage(self, used: Places) -> Leverage:
+        """Return the leverage of rows by the inputs ``used``."""
         size = self.inputs.shape[1]
-        used = np.setdiff1d(np.arange(size), withheld)
         among_used = np.ix_(used, used)
         inverses = [regular_inverse(gram[among_used]) for gram in self.grams]
         h = np.zeros(len(self.fold))
@@ -140,20 +140,20 @@ class CrossFit:
 
     Args:
         equations: of the rows.
-        alone: inputs of each value that may be predicted from its own joint alone.
+        by_arm: sets of inputs of each torque that are of a model of the arm.
         groups: (X,) the group of each value, by number.
         withheld: of each group the inputs that it is not predicted from.
 
     Attributes:
         weights: (X, I).
         errors: (N, X) cross-fitted.
-        joint_alone: (X,) 1 where a value is predicted from its own joint alone, else 0.
+        used: inputs that each value is predicted from.
     """
 
     def __init__(
         self,
         equations: FoldEquations,
-        alone: Mapping[int, Places],
+        by_arm: Mapping[int, Sequence[Places]],
         groups: Places,
         withheld: Sequence[Places],
     ) -> None:
@@ -162,28 +162,20 @@ class CrossFit:
         self.equations = equations
         self.weights = np.zeros((values, size))
         self.errors = np.zeros((rows, values))
-        self.joint_alone = np.zeros(values)
-        for value, joint_inputs in alone.items():
-            self._fit_alone(np.array([value]), joint_inputs)
+        self.used: list[Places] = [np.zeros(0, np.intp)] * values
+        self._squares = np.full(values, np.inf)  # of these errors
+        for value, candidates in by_arm.items():
+            for inputs in candidates:
+                self._fit(np.array([value]), inputs, worthwhile=1.0)
         for group, withheld_inputs in enumerate(withheld):
             used = np.setdiff1d(np.arange(size), withheld_inputs)
-            self._fit_group(np.flatnonzero(groups == group), used)
+            self._fit(np.flatnonzero(groups == group), used, WORTHWHILE)
 
-    def _fit_alone(self, value: Places, used: Places) -> None:
-        """Fit one value (1,) to the inputs of its own joint."""
-        penalty = RIDGE_PENALTIES[0]
-        self.errors[:, value] = self.equations.errors(used, value, penalty)
-        self.joint_alone[value] = 1.0
-        weights = self.equations.weights(ALL_ROWS, used, value, penalty)
-        self.weights[value, used] = weights[:, 0]
-
-    def _fit_group(self, targets: Places, used: Places) -> None:
-        """Fit a group by the penalty that leaves the least; a value stays alone where that leaves less."""
+    def _fit(self, targets: Places, used: Places, worthwhile: float) -> None:
+        """Fit values by the penalty that leaves the least, in place of an earlier fit of which only a share is left."""
         errors = [self.equations.errors(used, targets, penalty) for penalty in RIDGE_PENALTIES]
         squares = (np.array(errors) ** 2).sum(axis=1)  # (P, M)
-        squares_alone = (self.errors[:, targets] ** 2).sum(axis=0)
-        is_alone = self.joint_alone[targets] > 0
-        improves = squares.min(axis=0) < np.where(is_alone, squares_alone, np.inf)
+        improves = squares.min(axis=0) < worthwhile * self._squares[targets]
         best = squares.argmin(axis=0)  # (M,) which penalty
         for n, penalty in enumerate(RIDGE_PENALTIES):
             chosen = np.flatnonzero(improves & (best == n))
@@ -191,10 +183,12 @@ class CrossFit:
                 continue
             values = targets[chosen]
             self.errors[:, values] = errors[n][:, chosen]
-            self.joint_alone[values] = 0.0
+            self._squares[values] = squares[n, chosen]
             self.weights[values] = 0.0
             weights = self.equations.weights(ALL_ROWS, used, values, penalty)
             self.weights[np.ix_(values, used)] = weights.T
+            for value in values:
+                self.used[value] = used
 
     @property
     def R2(self) -> Floats:  # noqa: N802

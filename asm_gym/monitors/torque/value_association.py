@@ -42,6 +42,7 @@ from asm_gym.monitors.torque.crossfitting import (
     LEAST_REMAINDER,
     CrossFit,
     FoldEquations,
+    Leverage,
     folds_of,
     quadratic_form,
 )
@@ -53,6 +54,7 @@ Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
 
 ALIKE_S = 0.1  # time that errors are averaged over [s]
+NOTICEABLE = 0.99  # share of what is left without a body model, below which it is used
 PREDICTED = 0.5  # R² from which on a value is judged
 # With more inputs no leverage is computed: the matrices would be too large.
 MOST_LEVERAGE_INPUTS = 1024
@@ -64,9 +66,9 @@ LEARNED = (
     "judged_values",  # (V,) of the X values
     "R2_values",  # (X,) cross-fitted
     "D",  # (V, I)
-    "joint_alone",  # (V,) 1 where a value is predicted from its own joint alone, else 0
     "largest",  # (V,) q
-    "far",  # (G, I, I) leverage of each group that is judged; of no group with very many inputs
+    "far",  # (K, I, I) leverage by each set of inputs; of none with very many inputs
+    "far_of",  # (V,) which set of inputs a value is predicted from
 )
 
 
@@ -92,16 +94,17 @@ class FeatureFit(NamedTuple):
     features: ArmFeatures
     mean: Floats  # (M,) of the features
     spread: Floats  # (M,)
-    withheld: list[Places]  # of each group the inputs that it is not predicted from
     regression: CrossFit
 
 
 class ValueAssociation(ScaledModel):
     """Ridge regression of values; it has no context. Where nothing predicts a value, all are judged.
 
-    A body model, the text ``urdf`` as ``read_urdf`` reads it, takes the place of sines where it explains held-out
-    torques better: ``left_by_body`` is what it leaves, as a share of what is left without it. Where columns do not name
-    its joints, they are taken in the order that explains the torques best.
+    A torque is predicted by a model of the arm: friction of its joint, weight and inertia, all linear. All other senses
+    predict it where they leave less than half of the squared error of held-out rows. A body model, the text ``urdf`` as
+    ``read_urdf`` reads it, counts where it explains held-out torques better: ``left_by_body`` is what is left with it,
+    as a share of what is left without it. Where columns do not name its joints, they are taken in the order that
+    explains the torques best.
     """
 
     kind = "association_values"
@@ -149,7 +152,7 @@ class ValueAssociation(ScaledModel):
         judged = self.judged(regression.R2)
         if not len(judged):
             judged = np.arange(len(self.spec.sensory))
-        errors, leverages = self._weighed_errors(fit, judged)
+        errors, matrices, matrix_of = self._weighed_errors(fit, judged)
         columns: Places = np.zeros(0, np.intp)
         if fit.features.body is not None:
             columns = fit.features.body.columns
@@ -161,9 +164,9 @@ class ValueAssociation(ScaledModel):
             "judged_values": judged.astype(np.float64),
             "R2_values": regression.R2,
             "D": regression.weights[judged],
-            "joint_alone": regression.joint_alone[judged],
             "largest": self._largest_mean(errors, lengths),
-            "far": leverages,
+            "far": matrices,
+            "far_of": matrix_of.astype(np.float64),
         }
         return self.restore({**self.senses_.arrays, **learned})
 
@@ -238,14 +241,14 @@ class ValueAssociation(ScaledModel):
         )
 
     def _best_fit(self, rows: RegressionRows, fold: Places) -> FeatureFit:
-        """Return the fit by sines; or by the body model, where that leaves less of the torques."""
+        """Return the fit by sines; or by sines and body model, where that leaves less of the torques."""
         by_sines = self._fit_on(self._by_sines, rows, fold)
         if not self.urdf:
             return by_sines
         by_body = self._fit_on(self._ordered_body(rows), rows, fold)
         left_by_sines = max(self._unexplained(by_sines), LEAST_REMAINDER)
         self.left_by_body = self._unexplained(by_body) / left_by_sines
-        if self.left_by_body < 1.0:
+        if self.left_by_body < NOTICEABLE:
             return by_body
         return by_sines
 
@@ -274,14 +277,13 @@ class ValueAssociation(ScaledModel):
         inputs = inputs_of(rows, (derived - mean) / spread)
         size = inputs.shape[1]
         check_inputs(size)
-        withheld = self._withheld(features)
         regression = CrossFit(
             FoldEquations.of(inputs, rows.values, fold),
-            alone=self._joint_inputs(features, size),
+            by_arm=self._arm_inputs(features, size),
             groups=self.senses_.groups,
-            withheld=withheld,
+            withheld=self._withheld(features),
         )
-        return FeatureFit(features, mean, spread, withheld, regression)
+        return FeatureFit(features, mean, spread, regression)
 
     def _withheld(self, features: ArmFeatures) -> list[Places]:
         """Return the inputs of each group that hold its own values, which it is not predicted from."""
@@ -298,56 +300,71 @@ class ValueAssociation(ScaledModel):
             withheld.append(np.hstack([own_values, own_changes, before, own_features]))
         return withheld
 
-    def _joint_inputs(self, features: ArmFeatures, inputs: int) -> dict[int, Places]:
-        """Return which inputs are of each torque's own joint: its speed, friction and body, and commands.
+    def _arm_inputs(self, features: ArmFeatures, inputs: int) -> dict[int, list[Places]]:
+        """Return the sets of inputs that model the arm at each torque.
 
-        There are none where torques, speeds and angles of a body model do not belong together one by one.
+        All hold the friction of its joint, and commands; besides weight by sines and accelerations, or weight and
+        motion by the body and its own acceleration, or all of these. There are none where torques, speeds and angles
+        of a body model do not belong together one by one.
         """
         # Columns of ``inputs_of``: values, changes, values before, features, commands.
         senses = len(self.spec.sensory)
         joints = len(features.speeds)
-        features_per_joint = len(WIDTHS)
-        if len(self._torques) != joints:
+        has_body = features.body is not None
+        if len(self._torques) != joints or (has_body and len(features.angles) != joints):
             return {}
-        if features.body is not None:
-            features_per_joint += 2  # weight and motion
-            if len(features.angles) != joints:
-                return {}
-        # Each feature of all joints comes before the next feature.
-        of_first_joint = 3 * senses + joints * np.arange(features_per_joint)
-        commands = np.arange(inputs - len(self.spec.commanded) - 1, inputs)
-        speeds = features.speeds + senses * features.from_changes
-        own_inputs = {}
+        first_command = inputs - len(self.spec.commanded) - 1
+        first_weight = 3 * senses + joints * (len(WIDTHS) + 2 * has_body)
+        # Each feature of friction and body of all joints comes before the next, and sines follow.
+        own_features = np.arange(3 * senses, first_weight).reshape(-1, joints)
+        accelerations = senses + features.speeds
+        speeds = accelerations
+        if not features.from_changes:
+            speeds = features.speeds
+        by_sines = np.hstack([np.arange(first_weight, first_command), accelerations])
+        commands = np.arange(first_command, inputs)
+        arm_inputs = {}
         for joint, torque in enumerate(self._torques.tolist()):
-            own_inputs[torque] = np.hstack([speeds[joint], of_first_joint + joint, commands])
-        return own_inputs
+            common = [speeds[[joint]], own_features[: len(WIDTHS), joint], commands]
+            by_body = [own_features[len(WIDTHS) :, joint], accelerations[[joint]]]
+            candidates = [[*common, by_sines]]
+            if has_body:
+                candidates += [[*common, *by_body], [*common, *by_body, by_sines]]
+            arm_inputs[torque] = [np.unique(np.hstack(one)) for one in candidates]
+        return arm_inputs
 
-    def _weighed_errors(self, fit: FeatureFit, judged: Places) -> tuple[Floats, Floats]:
-        """Return cross-fitted errors (N, V), less where leverage is large, and the leverage (G, I, I) of each group."""
+    def _weighed_errors(self, fit: FeatureFit, judged: Places) -> tuple[Floats, Floats, Places]:
+        """Weigh cross-fitted errors by leverage.
+
+        Returns:
+            (N, V) errors, less where leverage is large; (K, I, I) leverage by each set of inputs; and (V,) which of
+            these sets a value is predicted from.
+        """
         regression = fit.regression
         size = regression.weights.shape[1]
         errors = regression.errors[:, judged]  # a copy
+        matrix_of = np.zeros(len(judged), np.intp)
         if size > MOST_LEVERAGE_INPUTS:
-            return errors, np.zeros((0, size, size))
-        groups = self.senses_.groups[judged]
-        by_groups = regression.joint_alone[judged] == 0
-        matrices = []
-        for group in np.unique(groups):
-            leverage = regression.equations.leverage(fit.withheld[group])
-            matrices.append(leverage.matrix)
-            errors[:, by_groups & (groups == group)] /= leverage.widening[:, None]
-        return errors, np.array(matrices)
+            return errors, np.zeros((0, size, size)), matrix_of
+        leverages: dict[bytes, Leverage] = {}
+        for n, value in enumerate(judged):
+            used = regression.used[value]
+            key = used.tobytes()
+            if key not in leverages:
+                leverages[key] = regression.equations.leverage(used)
+            errors[:, n] /= leverages[key].widening
+            matrix_of[n] = list(leverages).index(key)
+        matrices = [leverage.matrix for leverage in leverages.values()]
+        return errors, np.array(matrices), matrix_of
 
     def _widening(self, inputs: Floats) -> Floats:
         """Return √max(1, h/h̃) (N, V) of judged values, for inputs (N, I)."""
-        widening = np.ones((len(inputs), len(self._judged)))
-        groups = self.senses_.groups[self._judged]
-        by_groups = self.learned_["joint_alone"] == 0
-        # There are no matrices where the inputs are very many.
-        for group, matrix in zip(np.unique(groups), self.learned_["far"], strict=False):
-            leverage = np.maximum(1.0, quadratic_form(inputs, matrix))
-            widening[:, by_groups & (groups == group)] = np.sqrt(leverage)[:, None]
-        return widening
+        matrices = self.learned_["far"]
+        if not len(matrices):  # the inputs are very many
+            return np.ones((len(inputs), len(self._judged)))
+        by_matrix = np.stack([quadratic_form(inputs, matrix) for matrix in matrices], axis=1)
+        leverage = by_matrix[:, self.learned_["far_of"].astype(np.intp)]
+        return np.sqrt(np.maximum(1.0, leverage))
 
 
 def rows_after(lag: int, readings: Sequence[ScaledRows]) -> ScaledRows:

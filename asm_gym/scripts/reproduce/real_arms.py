@@ -29,6 +29,7 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.monitor_protocol import Surprise
+from asm_gym.monitors.sight import clip_of, first_alarm
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.readings import spans
@@ -44,8 +45,6 @@ RULE = "friction_rule"
 BODY = ", body"  # ends the name of a monitor that reads the arm's URDF
 WITH_BODY = tuple(name + BODY for name in ("neural_asm", "association_values", RULE))
 FOLDS = 4  # of which one is tested at a time
-BEFORE_S = 3.0  # of a clip before the fault [s]
-FAULT_S = 1.0  # length of a fault [s]
 
 
 @dataclass(frozen=True)
@@ -220,15 +219,6 @@ def faulty_clips(
     return kinds, clips
 
 
-def clip_of(episode: Episode) -> tuple[Episode, int]:
-    """Return the rows about the middle of a piece, and the row among them in which a fault begins."""
-    dt = episode.spec.dt
-    middle = len(episode) // 2
-    start = max(0, middle - round(BEFORE_S / dt))
-    rows = episode.stream[start : middle + round(FAULT_S / dt)]
-    return Episode.from_stream(rows, episode.spec, success=True), middle - start
-
-
 def healthy_result(monitor: CalibratedMonitor, score: Surprise) -> Record:
     """Return how many alarms a healthy piece raises, and its largest surprise [thresholds]."""
     threshold = monitor.threshold
@@ -246,14 +236,13 @@ def healthy_result(monitor: CalibratedMonitor, score: Surprise) -> Record:
 
 def fault_result(monitor: CalibratedMonitor, kind: str, clip: Episode, score: Surprise) -> Record:
     """Return whether a fault was found, after which delay [s], and its largest surprise [thresholds]."""
-    surprise = score.value / monitor.threshold
     onset = int(clip.faults.argmax())
-    rows_over = np.flatnonzero(surprise[onset:] > 1)
-    found = bool(len(rows_over)) and not (surprise[:onset] > 1).any()
+    alarm_row = first_alarm(score, monitor.threshold, onset)
     delay = np.nan
-    if found:
-        delay = clip.spec.dt * (rows_over[0] + 1)
-    excess = float(surprise[onset:].max())
+    if alarm_row is not None:
+        delay = clip.spec.dt * (alarm_row - onset + 1)
+    excess = float(score.value[onset:].max() / monitor.threshold)
+    found = alarm_row is not None
     return {"kind": kind, "added": True, "found": found, "delay": delay, "excess": excess}
 
 

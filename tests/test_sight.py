@@ -1,0 +1,42 @@
+"""What a monitor says that it sees, on held-out pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from asm_gym.data.episode import Episode
+from asm_gym.data.training_selection import pieces
+from asm_gym.monitors import make_monitor
+from asm_gym.monitors.monitor_protocol import Surprise
+from asm_gym.monitors.sight import clip_of, first_alarm, sights
+from tests.streams import pendulum_columns
+
+
+def test_an_error_that_a_monitor_says_it_sees_is_found_on_held_out_pieces_and_a_tenth_of_it_is_not():
+    cut = pieces(Episode.from_table(pendulum_columns(8000)), 1.0)
+    monitor = make_monitor("association_values", cut[0].spec).fit(cut[:40])
+    monitor.calibrate(cut[40:60], 0.06)
+    by_label = {sight.label: sight for sight in sights(monitor, cut[40:60])}
+    assert {"effort[0]", "effort[1]", "position[0]", "position[1]"} == set(by_label)
+    column = monitor.spec.labels.index("effort[0]")
+    found = {}
+    for factor in (0.1, 1.0):
+        alarms = []
+        for piece in cut[60:80]:
+            clip, onset = clip_of(piece)
+            stream = clip.stream.copy()
+            stream[onset:, column] += factor * by_label["effort[0]"].size
+            score = monitor.score(Episode.from_stream(stream, clip.spec))
+            alarms.append(first_alarm(score, monitor.threshold, onset) is not None)
+        found[factor] = np.mean(alarms)
+    assert found[1.0] >= 0.6
+    assert found[0.1] <= 0.3
+
+
+def test_an_alarm_before_the_onset_hides_what_comes_after_it():
+    def score(*values: float) -> Surprise:
+        return Surprise(np.array(values), np.zeros((len(values), 1)))
+
+    assert first_alarm(score(0, 0, 2, 2), 1.0, 1) == 2
+    assert first_alarm(score(2, 0, 2, 2), 1.0, 1) is None
+    assert first_alarm(score(0, 0, 1, 1), 1.0, 1) is None
