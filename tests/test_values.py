@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asm_gym.data.episode import Episode
@@ -74,6 +74,7 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
     assert (np.max(most, axis=0) < 1.1).all()
 
 
+@settings(deadline=None)
 @given(
     centre=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
     spread=st.tuples(st.floats(0.2, 1.0), st.floats(0.2, 1.0)),
