@@ -103,6 +103,33 @@ def test_the_most_surprising_channels_come_first(traces):
         figures.stream_figure(trace)
 
 
+def test_a_day_is_drawn_in_few_points_with_its_peaks_and_by_the_time_of_day():
+    rng = np.random.default_rng(0)
+    surprise = rng.gamma(3.0, 2.0, 100_000)
+    surprise[::20] = 50.0
+    surprise[54_321] = 1e4
+    stream = rng.normal(size=(len(surprise), 2))
+    stream[7_000, 0] = -99.0
+    day = ScoredEpisode(
+        kind="day",
+        seed=0,
+        dt=0.3,
+        threshold=20.0,
+        surprise=surprise,
+        origin=1_780_300_800.0,  # 08:00 UTC
+        stream=stream,
+        attribution=np.tile(surprise[:, None], 2),
+        channels=("a", "b"),
+    )
+    for figure, peak in ((figures.surprise_figure([day]), 1e4), (figures.stream_figure(day), -99)):
+        ax = figure.axes[0]
+        curve = ax.lines[0].get_ydata()
+        assert peak in curve
+        assert len(curve) < 5000
+        assert len(ax.lines) + len(ax.patches) < 1100
+        assert ax.xaxis.get_major_formatter()(1_780_304_400.0) == "09:00:00"
+
+
 class _Page(HTMLParser):
     """The tags and the text of a page."""
 

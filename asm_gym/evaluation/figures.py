@@ -6,6 +6,7 @@ Nothing touches pyplot's state. Colours are distinct with any colour vision; lin
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,9 +18,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from asm_gym.data.clock import date_of
 from asm_gym.data.column_behaviour import is_constant
 from asm_gym.data.inspection import Inspection
 from asm_gym.data.log_column import LogColumn
@@ -49,6 +51,8 @@ _LINES: tuple[Any, ...] = (
     (0, (1, 1)),
     (0, (8, 2, 2, 2, 2, 2)),
 )
+MOST_POINTS = 4000  # of a curve
+MOST_SPANS = 1000  # of time that are told apart
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _ALARM_BAR: dict[str, Any] = {
     "color": VERMILLION,
@@ -111,7 +115,7 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
         panels[0].set(yscale="log", ylim=(floor / 1.5, ceiling * 5))
         panels[0].yaxis.set_major_locator(LogLocator(numticks=5))
         panels[0].yaxis.set_minor_formatter(NullFormatter())
-        panels[-1].set_xlabel("time [s]")
+        _label_times(panels, traces)
         fig.supylabel("surprise", fontsize=10)
         handles = _surprise_legend(traces)
         fig.legend(handles=handles, loc="outside upper center", ncols=len(handles))
@@ -157,7 +161,7 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
     _shade(ax, missing, GREY, alpha=0.5)
     floor, ceiling = _limits([trace])
     surprise = np.clip(trace.surprise, floor, ceiling)
-    ax.plot(_times(trace), surprise, color=BLUE, linewidth=1.5)
+    ax.plot(*_thinned(_times(trace), surprise), color=BLUE, linewidth=1.5)
     ax.axhline(trace.threshold, color=BLACK, linewidth=1, linestyle=DASHED)
     _shade_fault(ax, trace)
     title = trace.condition
@@ -189,9 +193,9 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
             _shade(ax, _alarm_times(trace), VERMILLION, alpha=0.2)
             sensed = trace.stream[:, channel]
             finite = np.where(np.isfinite(sensed), sensed, np.nan)
-            ax.plot(_times(trace), finite, color=BLUE)
+            ax.plot(*_thinned(_times(trace), finite), color=BLUE)
             ax.set_title(trace.channels[channel])
-        axes[-1].set_xlabel("time [s]")
+        _label_times(axes, [trace] * len(axes))
         handles = [
             Line2D([], [], color=BLUE, label="sensed"),
             Patch(color=VERMILLION, alpha=0.2, label="alarm"),
@@ -229,14 +233,44 @@ def _times(trace: ScoredEpisode) -> Floats:
     return _start(trace) + (np.arange(len(trace)) + 1) * trace.dt  # (T,)
 
 
+def _label_times(panels: Sequence[Axes], traces: Sequence[ScoredEpisode]) -> None:
+    """Label the time axis of each panel, and name it under the last: time of day where the log has dates."""
+    label = "time [s]"
+    for ax, trace in zip(panels, traces, strict=True):
+        if date_of(_start(trace)):
+            ax.xaxis.set_major_formatter(FuncFormatter(lambda stamp, _: date_of(stamp)[11:19]))
+            ax.xaxis.set_major_locator(MaxNLocator(6))
+            label = "time of day (UTC)"
+    panels[-1].set_xlabel(label)
+
+
+def _thinned(times: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return times and values (T,) of a curve; of a long one, the least and the greatest of each short span."""
+    span = math.ceil(2 * len(values) / MOST_POINTS)
+    if span <= 2:
+        return times, values
+    whole = len(values) // span * span
+    spans_of_values = values[:whole].reshape(-1, span)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a span may lack all its numbers
+        ends = [np.nanmin(spans_of_values, axis=1), np.nanmax(spans_of_values, axis=1)]
+    kept = np.append(np.stack(ends, axis=1).ravel(), values[whole:])
+    kept_times = np.append(np.repeat(times[:whole:span], 2), times[whole:])
+    return kept_times, kept
+
+
 def _begin_and_end(trace: ScoredEpisode, rows: Sequence[tuple[int, int]]) -> Floats:
     """Return when spans (n, 2) of rows began and ended [s]."""
     return _start(trace) + trace.dt * np.array(rows)
 
 
 def _alarm_times(trace: ScoredEpisode) -> Floats:
-    """Return when each alarm began and ended (n, 2) [s]."""
-    rows = np.array(spans(trace.alarm)) + 1
+    """Return when each alarm began and ended (n, 2) [s]; those that no eye tells apart are one."""
+    rows = np.array(spans(trace.alarm)).reshape(-1, 2) + 1
+    is_apart = rows[1:, 0] - rows[:-1, 1] > len(trace) // MOST_SPANS
+    begins = np.append(rows[:1, 0], rows[1:, 0][is_apart])
+    ends = np.append(rows[:-1, 1][is_apart], rows[-1:, 1])
+    rows = np.stack([begins, ends], axis=1)
     return _start(trace) + np.minimum(rows, len(trace)) * trace.dt
 
 
@@ -265,7 +299,6 @@ def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
 
 ACROSS = 4  # panels side by side
 MOST_PANELS = 60  # channels drawn
-MOST_POINTS = 4000  # of a curve
 MOST_GAPS = 200  # shaded in a panel
 LONGEST_NAME = 30  # characters of a channel's name
 
