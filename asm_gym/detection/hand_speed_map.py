@@ -44,6 +44,8 @@ TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
 TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
 LEAST_UPRIGHT = 0.9  # other hands point down to within 26 degrees
 
+NOTHING_EARNED = np.zeros((0, FASTEST_COLUMNS.stop), np.float32)
+
 
 class HandSpeedMap:
     """How fast healthy hands went, by place and direction.
@@ -51,6 +53,7 @@ class HandSpeedMap:
     Args:
         cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of the momentum of an arm's hand and links, where no healthy hand was [N s].
+        earned: (N, 16) speeds that hands have earned under a guard (``guard.earned_speed``).
 
     Raises:
         ValueError: cells of another shape, places that are too far away, or negative speeds.
@@ -65,6 +68,7 @@ class HandSpeedMap:
         self,
         cells: AnyFloats,
         momentum: float = MOMENTUM,
+        earned: AnyFloats = NOTHING_EARNED,
     ) -> None:
         if not _are_cells(cells):
             raise ValueError(
@@ -73,14 +77,16 @@ class HandSpeedMap:
             )
         self.cells = cells
         self.momentum = momentum
+        self.earned = earned
 
-        places = cells[:, ARM_AND_PLACE].astype(np.int64)
+        all_cells = np.concatenate((cells, earned))
+        places = all_cells[:, ARM_AND_PLACE].astype(np.int64)
         self.low = places.min(axis=0) - (0, 1, 1, 1)
         offsets = places - self.low
         shape = np.add(offsets.max(axis=0), (1, 2, 2, 2))
         grid = np.zeros((*shape, 2 * AXES), np.float32)
         at = tuple(offsets.T)
-        np.maximum.at(grid, at, cells[:, FASTEST_COLUMNS])
+        np.maximum.at(grid, at, all_cells[:, FASTEST_COLUMNS])
 
         tilting = cells[:, FASTEST_COLUMNS][:, TILTING].max(axis=1)
         self.least_upright = LEAST_UPRIGHT
@@ -104,6 +110,10 @@ class HandSpeedMap:
         if not cells_by_task:
             return None
         return cls(np.concatenate(list(cells_by_task.values())))
+
+    def with_earned(self, earned: AnyFloats) -> Self:
+        """Return the map with other speeds (N, 16) that hands have earned."""
+        return type(self)(self.cells, self.momentum, earned)
 
     @classmethod
     def by_task(

@@ -40,6 +40,7 @@ class Actions:
             arms=simulation.arms,
             rest=self._rest,
             brake_speeds=simulation.speed_limits,
+            ahead=simulation.ahead,
         )
 
     def checked(self, action: Action) -> Action:

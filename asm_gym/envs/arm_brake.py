@@ -32,7 +32,16 @@ from asm_gym.envs.controllers import (
     solve,
     velocity_at,
 )
-from asm_gym.envs.mujoco_views import Arm, Floats, Goal, SubstepLimits, Views, Work
+from asm_gym.envs.mujoco_views import (
+    EVERYWHERE,
+    Ahead,
+    Arm,
+    Floats,
+    Goal,
+    SubstepLimits,
+    Views,
+    Work,
+)
 
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
@@ -93,18 +102,44 @@ def fastest_point(views: Views, arm: Arm) -> float:
 
 
 @partial(inner, inlined=True)
-def hardest_link(views: Views, arm: Arm, work: Work) -> float:
-    """Return p, the largest momentum of a link [N s].
+def hardest_link(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> float:
+    """Return p, the largest momentum of a link of arm ``a`` on its way to an obstacle [N s].
 
     ``work.factor`` is the Cholesky factor of the arm's mass matrix.
     """
     hardest = 0.0
     n = 0
     while arm.links[n] >= 0:
-        momentum = link_momentum(views, arm, n, work)
-        hardest = max(hardest, momentum)
+        if ahead.counts[a, n] != 0 and is_link_near(views, arm, a, n, ahead):
+            momentum = link_momentum(views, arm, n, work)
+            hardest = max(hardest, momentum)
         n += 1
     return hardest
+
+
+@partial(inner, inlined=True)
+def is_link_near(views: Views, arm: Arm, a: int, n: int, ahead: Ahead) -> bool:
+    """Whether a link of arm ``a`` is on its way to an obstacle."""
+    motion = views.cvel[arm.links[n]]
+    place = place_of(views, arm, n)
+    x, y, z = velocity_at(motion, place, views.subtree_com[arm.root])
+    turning = length(motion[:3])
+    return approaches(ahead.counts[a, n], ahead.directions[a, n], x, y, z, turning)
+
+
+@inner
+def approaches(
+    count: int, directions: Floats, x: float, y: float, z: float, turning: float
+) -> bool:
+    """Whether a link with a velocity [m/s], that turns by so much [rad/s], comes nearer to an obstacle."""
+    if count == EVERYWHERE:
+        return True
+    for k in range(count):
+        way = directions[k]
+        closing = way[0] * x + way[1] * y + way[2] * z
+        if closing + way[3] * turning > 0.0:
+            return True
+    return False
 
 
 @partial(inner, inlined=True)
@@ -162,7 +197,9 @@ def share_at(
 
 
 @partial(inner, inlined=True)
-def present_share(views: Views, arm: Arm, a: int, limit: SpeedLimit, work: Work) -> float:
+def present_share(
+    views: Views, arm: Arm, a: int, limit: SpeedLimit, ahead: Ahead, work: Work
+) -> float:
     """Return the share that arm ``a`` may have of its present motion."""
     twist = work.twist
     for axis in range(6):
@@ -172,7 +209,7 @@ def present_share(views: Views, arm: Arm, a: int, limit: SpeedLimit, work: Work)
     momentum = 0.0
     if limit.momentum < np.inf:
         cholesky(work.mass, arm.joint_count, work.factor)
-        momentum = hardest_link(views, arm, work)
+        momentum = hardest_link(views, arm, a, ahead, work)
     return share_at(views, arm, a, limit, twist, momentum)
 
 
@@ -194,7 +231,7 @@ def slow_down(
     limit = limits.motion[0]
     if is_beside_base(views, arm):
         limit = limits.motion[1]
-    share = present_share(views, arm, a, limit, work)
+    share = present_share(views, arm, a, limit, limits.ahead, work)
     share = min(share, speed_limit / speed)
     excess = max(0.0, 1.0 - share)
     goal.drive_lost = max(min(1.0, ALL_DRIVE * excess), DRIVE_LOST_KEPT * goal.drive_lost)

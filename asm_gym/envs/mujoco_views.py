@@ -17,6 +17,9 @@ MOST_BODIES = 48  # the most bodies, or dofs, of a robot with its gripper
 # numbers that limits apply to: external torque of the joints, then force at the wrist
 FELT = JOINTS + 3
 
+DIRECTIONS = 8  # the most in which a link may be near an obstacle, beyond which it is near
+EVERYWHERE = -1  # on all sides
+
 # Controllers that run compiled.
 OSC_POSE = 0
 JOINT_POSITION = 1
@@ -192,6 +195,22 @@ STATUS = np.dtype(
 MotionLimits = tuple[SpeedLimit, SpeedLimit]  # of hands, and of those beside their own base
 
 
+class Ahead(NamedTuple):
+    """In which directions the links of arms are near an obstacle; see ``obstacles``. Changed in place."""
+
+    counts: Ints  # (A, MOST_BODIES) how many directions there are, or ``EVERYWHERE``
+    # (A, MOST_BODIES, DIRECTIONS, 4) unit vector, and how far the link reaches about its centre [m]
+    directions: Floats
+
+    @classmethod
+    def everywhere(cls, arms: int) -> Ahead:
+        """Return arrays that say of each link that something is near it on all sides."""
+        return cls(
+            counts=np.full((arms, MOST_BODIES), EVERYWHERE, np.int64),
+            directions=np.zeros((arms, MOST_BODIES, DIRECTIONS, 4)),
+        )
+
+
 class SubstepLimits(NamedTuple):
     """Limits of the arms' load in every substep of a control step; changed in place."""
 
@@ -202,3 +221,4 @@ class SubstepLimits(NamedTuple):
     status: Any  # (1,) of STATUS
     speed_limits: Floats  # (A,) of an arm's fastest point, beyond which it is slowed down [m/s]
     motion: MotionLimits
+    ahead: Ahead

@@ -29,6 +29,7 @@ from asm_gym.envs.mujoco_views import (
     GOAL,
     JOINTS,
     STATUS,
+    Ahead,
     Floats,
     MotionLimits,
     NominalViews,
@@ -38,6 +39,7 @@ from asm_gym.envs.mujoco_views import (
     records,
 )
 from asm_gym.envs.nominal_dynamics import NominalDynamics
+from asm_gym.envs.obstacles import Obstacles
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.strain import StrainSensor
 from asm_gym.spec import Channel
@@ -72,6 +74,7 @@ class Simulation:
             status=records(1, STATUS),
             speed_limits=self.speed_limits,
             motion=(NO_SPEED_LIMIT, NO_SPEED_LIMIT),
+            ahead=Ahead.everywhere(arm_count),
         )
         self._motion_limits_set: ContactLimits | None = None
         self.proprioception = Proprioception(self.parts, self.views, self.data)
@@ -113,6 +116,8 @@ class Simulation:
         # whether control runs compiled
         self.compiled = all(is_compilable(part) for part in self.parts)
         self.arms = describe(self.parts, self.model)
+        self._obstacles = Obstacles(self.model, self.data, self.arms)
+        self._limits = self._limits._replace(ahead=self._obstacles.ahead)
         self._goals = records(len(self.parts), GOAL)
         self._goals.strengths[:] = 1.0
         self.controllers = [controller_of(part) for part in self.parts]
@@ -162,8 +167,14 @@ class Simulation:
         if limits is not self._limits_set:
             self._limits.load_limits[self._limited] = limits.limit_of_each(limited)
             self._limits_set = limits
+        self._obstacles.look()
         self._limits.status.armed = True
         self._limits.status.stops = limits.stays
+
+    @property
+    def ahead(self) -> Ahead:
+        """In which directions the arms are near obstacles; changed in place."""
+        return self._limits.ahead
 
     @property
     def motion_limits(self) -> MotionLimits:

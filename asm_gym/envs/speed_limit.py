@@ -24,10 +24,18 @@ from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, bind, compiled, inner
-from asm_gym.envs.arm_brake import is_beside_base, share_at, stopping_impulse, twist_speed
+from asm_gym.envs.arm_brake import (
+    approaches,
+    is_beside_base,
+    share_at,
+    stopping_impulse,
+    twist_speed,
+)
+from asm_gym.envs.controllers import length
 from asm_gym.envs.mujoco_views import (
     JOINT_ANGLES,
     UNKNOWN_CHANGE,
+    Ahead,
     Arm,
     Arms,
     Floats,
@@ -62,11 +70,15 @@ class SpeedLimiter:
         arms: its arms, and what their inputs are.
         rest: (A,) the action that changes nothing.
         brake_speeds: (arms,) written with each call: the speed from which on an arm is braked [m/s].
+        ahead: in which directions the arms are near obstacles.
     """
 
-    def __init__(self, views: Views, arms: Arms, rest: Action, brake_speeds: Floats) -> None:
+    def __init__(
+        self, views: Views, arms: Arms, rest: Action, brake_speeds: Floats, ahead: Ahead
+    ) -> None:
         self._views = views
         self._arms = arms
+        self._ahead = ahead
         self._rest = rest
         self._brake_speeds = brake_speeds
         joints = len(views.qvel)
@@ -85,7 +97,13 @@ class SpeedLimiter:
         if limits is not self._limits:
             self._limits = limits
             self._bound: Bound = bind(
-                self._views, self._arms, self._rest, limits, self._motion, self._brake_speeds
+                self._views,
+                self._arms,
+                self._rest,
+                limits,
+                self._motion,
+                self._brake_speeds,
+                self._ahead,
             )
         slow_action = action.copy()
         slow(self._bound, action, slow_action)
@@ -132,6 +150,14 @@ def read_asked(
 
 
 @partial(inner, inlined=True)
+def asks_nearer(ahead: Ahead, a: int, twist: Floats) -> bool:
+    """Whether the twist (6,) that is asked of arm ``a``'s hand leads it to an obstacle."""
+    turning = length(twist[3:])
+    x, y, z = twist[0], twist[1], twist[2]
+    return approaches(ahead.counts[a, 0], ahead.directions[a, 0], x, y, z, turning)
+
+
+@partial(inner, inlined=True)
 def asked_momentum(views: Views, motion: Motion) -> float:
     """Return |Λ v|, the momentum of an arm's hand in the motion that is asked of it [N s]."""
     address = motion.solved.ctypes.data
@@ -165,7 +191,7 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         action: what was asked for.
         slowed: a copy of it, in which the parts of arms that would be too fast are replaced.
     """
-    views, arms, rest, limits, motion, brake_speeds = bound.parts
+    views, arms, rest, limits, motion, brake_speeds, ahead = bound.parts
     for a in range(len(arms)):
         arm = arms[a]
         limit = limits[int(is_beside_base(views, arm))]
@@ -178,7 +204,7 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         _site_jacobian(views.model, views.data, linear, angular, arm.site)
         read_asked(views, arm, rest, action, motion)
         momentum = 0.0
-        if limit.momentum < np.inf:
+        if limit.momentum < np.inf and asks_nearer(ahead, a, motion.twist):
             momentum = asked_momentum(views, motion)
         share = share_at(views, arm, a, limit, motion.twist, momentum)
         brake_speeds[a] = max(limit.hand_speed, share * twist_speed(motion.twist))

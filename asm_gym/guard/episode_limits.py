@@ -43,7 +43,8 @@ class EpisodeLimits:
                 limits = replace(limits, stays=False, hand_speed=np.inf)
             careful = limits.reduced(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
 
-        self._usual_and_careful = limits, careful
+        self._usual = [limits] * facts.count  # of each robot
+        self._careful = careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))
         # (n,) of the policy, under the careful limits
         self._steps_left = np.zeros(facts.count, np.int64)
@@ -53,6 +54,13 @@ class EpisodeLimits:
         """Begin new episodes of the robots of ``which`` (n,)."""
         self._steps_left[which] = 0
         self._choose()
+
+    def set_pace(self, which: Mask, pace: HandSpeedMap) -> None:
+        """Let the hands of the robots of ``which`` (n,) go as fast as a map allows from their next episodes on."""
+        for robot in np.flatnonzero(which).tolist():
+            usual = self._usual[robot]
+            if usual is not None:
+                self._usual[robot] = replace(usual, pace=pace)
 
     def follow(self, acted: Mask, pressed: Mask) -> None:
         """Take account of a step: in robots of ``acted`` (n,) the policy acted, and of ``pressed`` (n,) too hard."""
@@ -64,7 +72,10 @@ class EpisodeLimits:
     def _choose(self) -> None:
         is_careful = self._steps_left > 0
         self.steady = not is_careful.any()
-        self.now = tuple(self._usual_and_careful[int(careful)] for careful in is_careful)
+        limits = self._usual.copy()
+        for robot in np.flatnonzero(is_careful).tolist():
+            limits[robot] = self._careful
+        self.now = tuple(limits)
 
 
 def limits_of(

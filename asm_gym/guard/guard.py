@@ -29,6 +29,7 @@ from asm_gym.guard.chunk_preview import Preview, one_row_each, preview_chunk
 from asm_gym.guard.commander import Command, Commander, Observe
 from asm_gym.guard.contact_state import no_load
 from asm_gym.guard.diagnostician import Diagnostician
+from asm_gym.guard.earned_speed import earned_speed_of
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.fitted_monitor import STALE, FittedMonitor, diagnosis_of
 from asm_gym.guard.judged_rows import JudgedRow, RowJudge
@@ -107,6 +108,8 @@ class Guard:
         self.terms = AlarmTerms()
         self.table = RobotTable(facts.count, spec, self.fitted.threshold)
 
+        self._nobody = np.zeros(facts.count, bool)  # never written to
+        self._everyone = ~self._nobody
         motion = None
         rule = None
         if policies or self._on_alarm in (*REFLEXES, GRADED):
@@ -125,19 +128,20 @@ class Guard:
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
         self._row_judge = self._new_row_judge(motion)
         self._commander = self._new_commander(motion, policies, monitor)
-        self._limits = EpisodeLimits(
-            facts,
-            limits_of(options.contact_limits, monitor, facts),
-            acts=self._on_alarm != "monitor" and facts.rest.size > 0,
-        )
+        limits = limits_of(options.contact_limits, monitor, facts)
+        acts = self._on_alarm != "monitor" and facts.rest.size > 0
+        self._limits = EpisodeLimits(facts, limits, acts)
+        self._earned = None
+        if options.earns_speed and acts and limits is not None:
+            self._earned = earned_speed_of(monitor, facts, limits)
+        if self._earned is not None:
+            self._limits.set_pace(self._everyone, self._earned.speed_map())
 
         self._wear = WearWatch(monitor, facts.count)
         self.running = self._arbiter.running
         self._acknowledgements = Acknowledgements(monitor, spec, facts.count)
         self._no_load = no_load(facts.count, facts.felt_size)
         self._warned: set[tuple[int, str]] = set()  # robots, and the part that failed
-        self._nobody = np.zeros(facts.count, bool)  # never written to
-        self._everyone = ~self._nobody
         self._all_active = True  # the field ``active`` of every record is True
         # What failed when the newest command was chosen, by robot.
         self._command_failures: Mapping[int, str] = NOTHING
@@ -229,6 +233,21 @@ class Guard:
         """Write the memory with the level shifts of a robot that were acknowledged, in a note."""
         self._acknowledgements.save(path, robot)
 
+    def keep_earned_speed(self) -> None:
+        """Keep in the memory what hands have earned in this task; the next guard of it begins with that.
+
+        Raises:
+            ValueError: nothing can be earned here.
+        """
+        if self._earned is None:
+            task = self._facts.task or "this environment"
+            raise ValueError(
+                f"no speed is earned in {task}: the memory knows its pace, or the guard limits no "
+                "speed, or earns_speed is False"
+            )
+        memory: Any = self.fitted.monitor
+        memory.earned_ = memory.earned_ | {self._facts.task: self._earned.cells}
+
     def acknowledge_wear(self) -> None:
         """Forget all wear: the next blocks of operation say what is healthy."""
         self._wear.acknowledge()
@@ -238,6 +257,8 @@ class Guard:
         if which is None:
             which = self._everyone
         self._arbiter.follow_thresholds(which)
+        if self._earned is not None and self._earned.end_episodes(which):
+            self._limits.set_pace(which, self._earned.speed_map())
         for part in (
             self.table,
             self._arbiter,
@@ -347,6 +368,8 @@ class Guard:
             self._acknowledgements.note_alarms(self.table.records["over"], row.attribution)
             self._decide(row)
         self._wear.follow(row.rows, self.table.records)
+        if self._earned is not None:
+            self._earned.follow(row.rows, self.table.records)
         self._prepare_next_step(row)
         report = self._report(row)
         if row.eventful:

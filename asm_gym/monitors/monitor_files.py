@@ -20,7 +20,8 @@ from asm_gym.validation import check_choice, check_number
 
 BLOCKS = "nominal_blocks"
 MAXIMA = "nominal_maxima"
-PACE_PREFIX = "pace "  # begins the names of the speeds of hands in each task
+BY_TASK = {"pace_": "pace ", "earned_": "earned "}
+"""What begins the names of the arrays of each attribute that has one for each task."""
 
 OPTIONAL = {
     "learned_from_": "learned_from",
@@ -66,12 +67,10 @@ def read_monitor(saved: Checkpoint) -> SavedMonitor:
         calibration["blocks_"] = Blocks.restored(arrays.pop(BLOCKS))
 
     healthy = [check_number("healthy", value, low=0.0) for value in header["healthy"]]
-    tasks = [name for name in arrays if name.startswith(PACE_PREFIX)]
-    attributes: dict[str, Any] = {
-        "about": dict(header["about"]),
-        "healthy_": tuple(healthy),
-        "pace_": {name.removeprefix(PACE_PREFIX): arrays.pop(name) for name in tasks},
-    }
+    attributes: dict[str, Any] = {"about": dict(header["about"]), "healthy_": tuple(healthy)}
+    for attribute, prefix in BY_TASK.items():
+        tasks = [name for name in arrays if name.startswith(prefix)]
+        attributes[attribute] = {name.removeprefix(prefix): arrays.pop(name) for name in tasks}
     for attribute, name in OPTIONAL.items():
         attributes[attribute] = arrays.pop(name, None)
     return SavedMonitor(arrays, attributes, calibration)
@@ -103,8 +102,9 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
     for attribute, name in OPTIONAL.items():
         if getattr(monitor, attribute) is not None:
             arrays[name] = getattr(monitor, attribute)
-    for task, cells in monitor.pace_.items():
-        arrays[PACE_PREFIX + task] = cells
+    for attribute, prefix in BY_TASK.items():
+        for task, cells in getattr(monitor, attribute).items():
+            arrays[prefix + task] = cells
 
     header = {
         "spec": monitor.spec.to_json(),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -33,14 +34,17 @@ from asm_gym.scripts.reproduce import harm_search, kit
 from asm_gym.scripts.reproduce.harm_cases import (
     CASE,
     CONTROL_RATE,
+    EARNED,
     ELSEWHERE,
     GUARDS,
     RAMMED_TASKS,
     Case,
+    earn,
     guarded,
 )
 from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.tasks import env_id
+from asm_gym.validation import check_number
 
 UNMET_TASKS = ("PickPlaceMilk", "NutAssemblyRound")
 """Tasks that the Panda's memory has not met, with healthy policies alone."""
@@ -70,7 +74,8 @@ IMPAIRMENTS = {
 IMPAIRED_TASKS = ("Lift", "PickPlaceCan")
 RAMMING = ("down", "aside and down", "forward", "ramp")
 """Hostile policies that act with an impairment."""
-AGAINST = ("hostile", "elsewhere", "impaired", "faulty")
+AGAINST = ("hostile", "elsewhere", "impaired", "faulty", "unmet")
+a_count = partial(check_number, "earned", low=1, whole=True)
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 LITTLE = 1.0  # a cell with no more harm without a guard does not count [N s]
 
@@ -86,10 +91,13 @@ class Config(kit.Config):
     against: tuple[str, ...] = option(("hostile",), known=AGAINST, metavar="NAME")
     """Which policies. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Impaired are ramming ones
     with a weak joint, or with a bias of the action behind the guard. Faulty are healthy ones in Lift and Stack under
-    each kind of fault."""
+    each kind of fault. Unmet are hostile ones in the tasks that the memory has not met."""
     search: int = option(0, least=0)
     """Episodes of a search for the hardest contact, under each guard, with each arm in each task; nothing else is done.
     """
+    earned: tuple[int, ...] = option((), check=a_count, metavar="EPISODES")
+    """Also guards that have earned speed for so many episodes of the task's expert, in tasks that the memory has not
+    met."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option(
@@ -108,6 +116,11 @@ def cases(config: Config) -> list[tuple[Case, int]]:
     slower = [
         Case("hostile", "down", trial, speed=speed) for trial, speed in product(rammed, SLOWER)
     ]
+    unmet = [
+        Case("hostile", name, trials[task])
+        for task, name in product(UNMET_TASKS, HOSTILE)
+        if task in trials
+    ]
     elsewhere = [case._replace(config=arm) for arm, case in product(ELSEWHERE, hostile)]
     healthy = [Case("healthy", policy, trials[task]) for task, policy in HEALTHY if task in trials]
     faulty = []
@@ -120,6 +133,7 @@ def cases(config: Config) -> list[tuple[Case, int]]:
         "elsewhere": elsewhere,
         "impaired": impaired_cases(hostile),
         "faulty": faulty,
+        "unmet": unmet,
     }
     counted = [(case, config.episodes) for name in config.against for case in against[name]]
     return counted + [(case, config.healthy) for case in healthy]
@@ -172,17 +186,25 @@ def run(config: Config) -> kit.Findings:
     if config.search:
         tasks = [task for task in config.tasks if task in RAMMED_TASKS]
         return harm_search.run(tasks, config.guards, config.search, config)
+    unmet = [task for task in config.tasks if task in UNMET_TASKS]
+    folder = str(config.out)
+    if config.earned:
+        config.out.mkdir(parents=True, exist_ok=True)
+        kit.each("earning", earn, [(folder, task, config.earned) for task in unmet], config)
     jobs = []
     for repetition, (case, count) in product(config.repetitions, cases(config)):
-        for number, guard in product(range(count), config.guards):
+        guards = [*config.guards]
+        if case.trial.task in unmet:
+            guards += [f"{EARNED}{episodes}" for episodes in config.earned]
+        for number, guard in product(range(count), guards):
             trial = replace(case.trial, seed=10_000 * repetition + 1000 + number)
-            jobs.append((case._replace(trial=trial), guard))
+            jobs.append((case._replace(trial=trial, folder=folder), guard))
     records = kit.resumed("episodes", episode, jobs, config)
     frame = pd.DataFrame(records)
     hostile = frame[frame.kind == "hostile"]
     healthy = frame[frame.kind == "healthy"]
     faulty = frame[frame.kind == "faulty"]
-    guards = config.guards
+    guards = [*dict.fromkeys(frame.guard)]
     arms = ("robot", "rate", "task")
     tables = [
         by_guard("Hostile policies, by arm and rate", hostile, guards, arms, ("kind",)),
@@ -194,7 +216,7 @@ def run(config: Config) -> kit.Findings:
     drawn = None
     if len(hostile) and len(healthy) and POLICY_ALONE in guards:
         usual = frame[(frame.robot == "Panda") & (frame.rate == CONTROL_RATE)]
-        drawn = frontier(usual, guards)
+        drawn = frontier(usual, config.guards)
     return kit.Findings(records, [table for table in tables if table.rows], drawn)
 
 
@@ -208,7 +230,8 @@ def by_guard(
     rows = []
     for columns in groups:
         for _, own in frame.groupby(list(columns), sort=False):
-            rows += [guard_row(own, guard) for guard in guards]
+            present = [guard for guard in guards if (own.guard == guard).any()]
+            rows += [guard_row(own, guard) for guard in present]
     return kit.table_of(caption, rows)
 
 
