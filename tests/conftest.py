@@ -3,7 +3,15 @@
 import gymnasium as gym
 import pytest
 
+from asm_gym.envs.obstacles import Obstacles
+
 import asm_gym  # noqa: F401
+
+
+@pytest.fixture
+def surrounded(monkeypatch):
+    """Let arms believe that something that does not give way is near them on all sides."""
+    monkeypatch.setattr(Obstacles, "look", lambda obstacles: None)
 
 
 @pytest.fixture(scope="session")

@@ -32,12 +32,12 @@ def hardest(env, limits, action, steps=12):
     [[1, 0, 0, 0, 0, 0, 0], [0, 0, 0, -1, 0, 0, 0], [0, 1, 0.5, 0, 1, 1, 0]],
     ids=["stretching", "rolling", "both"],
 )
-def test_no_link_has_more_momentum_than_it_may(lift, action):
+def test_no_link_has_more_momentum_than_it_may(lift, action, surrounded):
     braked = hardest(lift, ContactLimits(**FREE, momentum=1.0), action)
     assert 0.5 < braked < 2.0 < hardest(lift, ContactLimits(**FREE), action) / 1.5
 
 
-def test_what_a_fault_adds_behind_the_guard_is_braked_too(lift):
+def test_what_a_fault_adds_behind_the_guard_is_braked_too(lift, surrounded):
     biased = FaultInjection(lift, [ActionBias(axis=0, amount=2.0, onset=2)])
     rest = np.zeros(7)
     unlimited = hardest(biased, ContactLimits(**FREE), rest)

@@ -203,7 +203,9 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
     assert 0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)
 
 
-def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_healthy_hand_was(lift):
+def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_healthy_hand_was(
+    lift, surrounded
+):
     def most(action, pace):
         """The greatest momentum [N s] and speed [m/s] of a hand that is driven by an action for three seconds."""
         lift.reset(seed=0)

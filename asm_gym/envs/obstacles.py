@@ -29,7 +29,6 @@ class ArmGeoms(NamedTuple):
     links: Ids  # (G,) index of the link that each geom of the arm belongs to, from the hand on
     geoms: Ids  # (G,)
     obstacles: Ids  # (O,) other geoms
-    is_plane: NDArray[np.bool_]  # (ngeom,)
     radii: Floats  # (ngeom,) of the ball around each geom [m]
     boxes: Floats  # (ngeom, 6) centre and half edges of the box around each, in its frame [m]
     places: Floats  # (ngeom, 3)
@@ -48,7 +47,6 @@ class ArmGeoms(NamedTuple):
             links=link_of_geom[own],
             geoms=own,
             obstacles=np.flatnonzero(is_obstacle),
-            is_plane=model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE,
             radii=model.geom_rbound,
             boxes=model.geom_aabb,
             places=data.geom_xpos,
@@ -136,10 +134,6 @@ def write_way(arm: Any, geom: int, obstacle: int, way: Floats) -> float:
             along += frame[3 * k + axis] * apart
         half = arm.boxes[obstacle, 3 + axis]
         back = min(max(along, -half), half) - along
-        if arm.is_plane[obstacle]:
-            back = 0.0
-            if axis == 2:
-                back = min(-along, 0.0)
         square += back * back
         for k in range(3):
             way[k] += frame[3 * k + axis] * back

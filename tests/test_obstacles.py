@@ -1,0 +1,101 @@
+"""What does not give way near an arm: its directions, and that only motion towards it is slowed down."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.envs.mujoco_views import ARM, EVERYWHERE, records
+from asm_gym.envs.obstacles import NEAR, Obstacles
+
+WORLD = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1"/>
+    <body name="wall" pos=".5 0 .5" euler="0 20 30"><geom type="box" size=".05 .2 .3"/></body>
+    <body name="ball" pos="0 .5 .5"><freejoint/><geom type="sphere" size=".1"/></body>
+    <body name="door" pos="0 -.5 .5"><joint type="hinge"/><geom type="box" size=".1 .02 .2"/></body>
+    <body name="arm" mocap="true"><geom name="hand" type="sphere" size=".04"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def world():
+    """A ball-shaped hand that can be put anywhere, among things that give way and others."""
+    model = mujoco.MjModel.from_xml_string(WORLD)
+    data = mujoco.MjData(model)
+    arms = records(1, ARM)
+    arms[0].links[:] = -1
+    arms[0].links[0] = model.body("arm").id
+    return model, data, Obstacles(model, data, arms)
+
+
+def directions_at(world, place):
+    """Return the unit vectors to what is near a hand at a place; None where it is near on all sides."""
+    model, data, obstacles = world
+    data.mocap_pos[0] = place
+    mujoco.mj_kinematics(model, data)
+    obstacles.look()
+    count = obstacles.ahead.counts[0, 0]
+    if count == EVERYWHERE:
+        return None
+    return obstacles.ahead.directions[0, 0, :count, :3]
+
+
+def test_directions_are_those_of_the_nearest_points_that_mujoco_finds(world):
+    model, data, _ = world
+    rng = np.random.default_rng(0)
+    hand = model.geom("hand").id
+    fixed = [
+        model.geom("floor").id,
+        *(model.body(name).geomadr[0] for name in ("wall", "door")),
+    ]
+    seen = 0
+    for _ in range(2000):
+        found = directions_at(world, rng.uniform(-0.8, 0.8, 3) + (0, 0, 0.6))
+        expected = []
+        touches = False
+        for geom in fixed:
+            points = np.zeros(6)
+            distance = mujoco.mj_geomDistance(model, data, hand, geom, 1.0, points)
+            touches |= distance < 0.0
+            if distance < NEAR:
+                way = points[3:] - points[:3]
+                expected.append(way / np.linalg.norm(way))
+        if touches or not expected:
+            continue
+        assert found is not None and len(found) == len(expected)
+        np.testing.assert_allclose(np.sort(found, axis=0), np.sort(expected, axis=0), atol=1e-3)
+        seen += 1
+    assert seen > 20
+
+
+def test_things_that_lie_freely_do_not_count(world):
+    assert len(directions_at(world, [0.0, 0.38, 0.5])) == 0
+    assert len(directions_at(world, [0.0, -0.40, 0.5])) == 1
+
+
+def test_a_hand_within_an_obstacle_is_near_it_on_all_sides(world):
+    assert directions_at(world, [0.0, -0.5, 0.5]) is None
+
+
+def test_an_arm_is_slowed_down_on_its_way_to_the_table_and_not_away_from_it(lift):
+    limits = ContactLimits(1e6, 1e6, hand_speed=0.5, momentum=0.5)
+    lift.reset(seed=0)
+    arm = lift.unwrapped
+    arm.contact_limits = limits
+    down = np.float32([0, 0, -1, 0, 0, 0, 0])
+    braked = []
+    for _ in range(60):
+        *_, info = lift.step(down)
+        braked.append(info["braked"])
+    height = arm.simulation.data.site_xpos[arm.simulation.arms.site[0]][2]
+    away = []
+    for _ in range(20):
+        *_, info = lift.step(-down)
+        away.append(info["braked"])
+    risen = arm.simulation.data.site_xpos[arm.simulation.arms.site[0]][2] - height
+    assert braked[0] == 0.0 and max(braked) > 0.5
+    assert risen > 0.1 and max(away[5:]) == 0.0
