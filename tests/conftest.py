@@ -3,9 +3,8 @@
 import gymnasium as gym
 import pytest
 
-from asm_gym.envs.obstacles import Obstacles
-
 import asm_gym  # noqa: F401
+from asm_gym.envs.obstacles import Obstacles
 
 
 @pytest.fixture
