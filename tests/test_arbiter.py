@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from asm_gym.guard.alarm_terms import CONTACT, SURPRISE
 from asm_gym.guard.arbiter import POLICY_ACTS, Arbiter, Situation, following
 from asm_gym.guard.options import ReleaseRule
-from asm_gym.guard.reflexes import COMPLIANCE, FeltMotion
+from asm_gym.guard.reflexes import COMPLIANCE, FeltMotion, leaving
 from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import ENDED, POLICY, REFLEX, STATES, RobotTable
@@ -192,6 +192,18 @@ def test_comply_gives_way_beyond_what_is_usual_and_tolerated():
     np.testing.assert_allclose(felt.move(0, "comply").action, COMPLIANCE * 0.05 * beyond, rtol=1e-6)
     felt.arrays.torque[0] = felt.arrays.usual_torque[0]
     assert not felt.move(0, "comply").action.any()
+
+
+def test_what_a_policy_asks_away_from_a_contact_is_done_and_nothing_else():
+    felt = reflexes("graded")
+    felt.arrays.torque[0] = [10.0, 0.0]
+    away = leaving(felt, 0, np.float32([0.8, -0.6]))
+    np.testing.assert_allclose(away.action, [0.8, 0.0], rtol=1e-6)
+    assert not away.brakes
+    for towards in ([-0.8, 0.6], [0.0, 1.0]):
+        assert leaving(felt, 0, np.float32(towards)) is None
+    felt.arrays.torque[0] = [3.0, 0.0]  # which is tolerated
+    assert leaving(felt, 0, np.float32([0.8, -0.6])) is None
 
 
 def test_a_reflex_that_the_robots_cannot_do_is_refused_and_graded_stays_instead():

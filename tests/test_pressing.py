@@ -260,3 +260,28 @@ def test_an_impulse_that_ends_the_episode_is_an_alarm():
     found = weighed([0.0, 6000.0])  # with what one row leaves of the time to lean
     assert found[-1, 1] > IMPULSE
     assert found[-1, 2]
+
+
+def test_a_policy_that_turns_back_leaves_a_contact_while_the_guard_holds(lift):
+    holds = {"pressing": "hold", "lasting pressing": "hold"}
+    env = NeuralASMSafety(lift, responses=holds)
+    env.reset(seed=0)
+    down = np.float32([0, 0, -1, 0, 0, 0, -1])
+    said = {}
+    for _ in range(120):
+        *_, info = env.step(down)
+        said = info["asm"]
+        if said["state"] == "reflex":
+            break
+    assert said["state"] == "reflex"
+    simulation = lift.unwrapped.simulation
+    site = simulation.arms.site[0]
+    before = simulation.data.site_xpos[site][2]
+    *_, info = env.step(-down)
+    executed = info["asm"]["executed_action"]
+    assert info["asm"]["intervened"]
+    assert executed[2] > 0.0
+    for _ in range(5):
+        *_, info = env.step(-down)
+    assert simulation.data.site_xpos[site][2] > before
+    assert info["contact_force"] < 40.0

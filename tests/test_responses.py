@@ -264,3 +264,26 @@ def test_a_cause_is_the_same_on_any_number_of_threads():
             rows = senses.mean + senses.spread * rng.normal(size=(3, 12, len(senses.mean)))
             causes.append([diagnosis(own, np.ones(len(senses.mean))).probabilities for own in rows])
     assert causes[0] == causes[1] == causes[2]
+
+
+def test_slow_lets_the_policy_go_on_at_a_quarter_of_the_speed_whatever_the_cause(lift):
+    monitor = CueMonitor({5}, spec=lift.unwrapped.stream_spec)
+    env = NeuralASMSafety(lift, monitor, on_alarm="graded", responses={"unknown": "slow"})
+    env.reset(seed=0)
+    action = np.float32([0, 1, 0, 0, 0, 0, -1])
+    said = [env.step(action)[-1]["asm"] for _ in range(40)]
+    assert said[5]["transition"] == "slow"
+    assert not any(s["intervened"] for s in said)
+    speeds = [s["executed_action"][1] for s in said]
+    assert speeds[10] == pytest.approx(speeds[4] / 4, rel=0.05)
+    assert speeds[-1] == pytest.approx(speeds[4], rel=0.05)
+
+
+def test_slow_is_refused_where_no_speed_can_be_limited():
+    with pytest.raises(ValueError, match="slow"):
+        NeuralASMSafety(Acting(), Judge({10}), responses={"contact": "slow"})
+
+
+def test_a_pressing_arm_is_never_let_go_on_slowly():
+    with pytest.raises(ValueError, match="pressing"):
+        responses_from({"pressing": "slow"})

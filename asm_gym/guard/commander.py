@@ -14,7 +14,7 @@ from asm_gym.compilation import compiled, inner
 from asm_gym.detection.commands import command_limits
 from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.observer import joined
-from asm_gym.guard.reflexes import FeltMotion, Motion
+from asm_gym.guard.reflexes import FeltMotion, Motion, leaving
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import REFLEX, Floats32, Mask, RobotTable
 from asm_gym.policies.hold import Hold, HoldingActions
@@ -148,7 +148,10 @@ class Commander:
             refusal = ""
             if refused[robot]:
                 refusal = self._refuse(robot, proposed[robot])
-            motion, reflex_failure = self._react(robot, reflexes[robot], observe)
+            leaving_action = None
+            if not refused[robot]:
+                leaving_action = proposed[robot]
+            motion, reflex_failure = self._react(robot, reflexes[robot], observe, leaving_action)
             executed[robot] = motion.action
             brakes[robot] = motion.brakes
             failure = joined(refusal, reflex_failure)
@@ -168,15 +171,20 @@ class Commander:
         self.start_override(robot, self._executed[robot])
         return failure
 
-    def _react(self, robot: int, reflex: str, observe: Observe) -> tuple[Motion, str]:
-        """Return what a robot does in an override, within its bounds, and what failed: then the robot stays."""
+    def _react(
+        self, robot: int, reflex: str, observe: Observe, proposed: Floats32 | None
+    ) -> tuple[Motion, str]:
+        """Return what a robot does in an override, within its bounds, and what failed: then the robot stays.
+
+        An action (A,) that the policy proposes may lead away from a contact; None for none.
+        """
         facts = self._facts
         stay = Motion(self.holding.stay(robot), brakes=facts.brakes, keeps_grip=facts.rest_is_known)
         motion = stay
         failure = ""
         try:
             if self._reacts:
-                motion = self._reflex_motion(robot, reflex, observe)
+                motion = self._reflex_motion(robot, reflex, observe, proposed)
             action = np.array(as_float32(motion.action)).reshape(-1)
             if action.shape != facts.rest.shape or not np.isfinite(action).all():
                 raise ValueError(
@@ -195,9 +203,16 @@ class Commander:
         within = np.clip(action, facts.low, facts.high)
         return motion._replace(action=within), failure
 
-    def _reflex_motion(self, robot: int, reflex: str, observe: Observe) -> Motion:
+    def _reflex_motion(
+        self, robot: int, reflex: str, observe: Observe, proposed: Floats32 | None
+    ) -> Motion:
         """Return what the reflex of a name, or the user's own policy, does."""
         if self._motion is not None:
+            away = None
+            if proposed is not None:
+                away = leaving(self._motion, robot, proposed)
+            if away is not None:
+                return away
             return self._motion.move(robot, reflex)
         policy = self._policies[robot]
         is_first = robot not in self._policy_states  # step of the override

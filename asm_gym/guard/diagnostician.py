@@ -14,7 +14,7 @@ from asm_gym.detection.channel_columns import handled_columns
 from asm_gym.detection.contact_limits import FREE_FORCE
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.contact_estimator import ContactEstimator
-from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
+from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, SLOW, Response
 from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
 from asm_gym.guard.robot_table import POLICY, Floats32, Mask
 from asm_gym.guard.row_evidence import RowEvidence
@@ -282,6 +282,8 @@ def _may_go_on(name: str, cause: Cause, evidence: RowEvidence) -> bool:
         return False
     if name == "complete":  # what is left judges on, and what is completed is bounded by itself
         return True
-    if not (evidence.may_go_on and evidence.feels and cause.probability >= SURE):
+    if not (evidence.may_go_on and evidence.feels):
+        return False
+    if name != SLOW and cause.probability < SURE:
         return False
     return not evidence.robot.contact_force > FREE_FORCE

@@ -36,7 +36,7 @@ from asm_gym.guard.judged_rows import JudgedRow, RowJudge
 from asm_gym.guard.observer import Observer, invalid_surprises, merged_failures
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, MotionArrays
-from asm_gym.guard.responses import Response, responses_from, unexplained
+from asm_gym.guard.responses import SLOW, Response, responses_from, unexplained
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.guard.robot_table import (
     REFLEX,
@@ -79,8 +79,8 @@ class Guard:
         ends_on_alarm: an alarm ends the episode.
 
     Raises:
-        ValueError: a reflex that these robots cannot do, or contact limits of another arm; ``"recall"`` with a monitor
-            that expects no action.
+        ValueError: a reflex or response that these robots cannot do, or contact limits of another arm;
+            ``"recall"`` with a monitor that expects no action.
     """
 
     def __init__(
@@ -121,9 +121,12 @@ class Guard:
             completion = diagnosis.completion
 
         self._arbiter = Arbiter(self.table, rule, options.adaptive_threshold)
-        self._diagnostician = Diagnostician(
-            spec, diagnosis, responses_from(options.responses), self._graded
-        )
+        responses = responses_from(options.responses)
+        if SLOW in responses.values() and not facts.limits_contact:
+            raise ValueError(
+                "the response 'slow' needs an environment of this package, whose speed can be limited"
+            )
+        self._diagnostician = Diagnostician(spec, diagnosis, responses, self._graded)
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
         self._row_judge = self._new_row_judge(motion)
@@ -544,7 +547,10 @@ class Guard:
             counts = pressed
             if row.ends_step:
                 counts = policy_acted
-            self._limits.follow(counts, pressed)
+            slowed = self._nobody.copy()
+            for robot, outcome in row.outcomes.items():
+                slowed[robot] = outcome.decision.transition == SLOW
+            self._limits.follow(counts | slowed, pressed | slowed)
 
     def _report(self, row: JudgedRow) -> RowReport:
         """Return what became of the row; there is nothing to say of robots whose rows do not count."""

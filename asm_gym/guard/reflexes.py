@@ -5,6 +5,10 @@
     comply    dq = c dt sign(τ) max(|τ| - τ_tolerated, 0),   τ beyond the usual torque
     recall    the action that the memory expects
 
+Whatever the reflex, a policy may leave a contact: of its action a the part along the direction c of ``comply`` is done,
+
+    a' = max(0, a · c) c
+
 A reflex is a function of ``FeltMotion`` and of the robot's index. To add one, write the function
 and name it in ``REFLEXES``.
 """
@@ -168,9 +172,31 @@ def comply(motion: FeltMotion, robot: int) -> Motion:
     """Give way along the external torque beyond the usual, as a damper would."""
     robots = motion.robots
     assert robots.turning_action is not None
-    torque = motion.arrays.torque[robot] - motion.arrays.usual_torque[robot]
-    beyond = np.sign(torque) * np.maximum(np.abs(torque) - motion.tolerated, 0.0)
+    beyond = pressing_torque(motion, robot)
     return Motion(robots.turning_action(robot, COMPLIANCE * robots.dt * beyond))
+
+
+def pressing_torque(motion: FeltMotion, robot: int) -> NDArray[np.float64]:
+    """Return (J,) the external torque of a robot's joints beyond what is usual and tolerated [N m]."""
+    torque = motion.arrays.torque[robot] - motion.arrays.usual_torque[robot]
+    return np.asarray(np.sign(torque) * np.maximum(np.abs(torque) - motion.tolerated, 0.0))
+
+
+def leaving(motion: FeltMotion, robot: int, proposed: Floats32) -> Motion | None:
+    """Return the part of a policy's action (A,) that leads away from what presses; None without such a part."""
+    robots = motion.robots
+    if robots.turning_action is None or not motion.arrays.torque_columns.size:
+        return None
+    beyond = pressing_torque(motion, robot)
+    if not beyond.any():
+        return None
+    way = np.array(robots.turning_action(robot, COMPLIANCE * robots.dt * beyond), np.float64)
+    way[robots.grip] = 0.0
+    length = np.linalg.norm(way)
+    along = float(proposed @ way)
+    if not along > 0.0:
+        return None
+    return Motion((along / length**2 * way).astype(np.float32))
 
 
 def recall(motion: FeltMotion, robot: int) -> Motion:

@@ -19,13 +19,15 @@ PRESSING = "pressing"
 CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
 """What a table of responses says something about."""
 
-GOING_ON = ("go on", "complete")  # responses to an alarm under which the policy acts
+SLOW = "slow"
+GOING_ON = ("go on", "complete", SLOW)  # responses to an alarm under which the policy acts
 
 STAYING = ("hold", "comply", "retract", "stop")  # responses under which it does not
 
 RESPONSES = (*GOING_ON, *STAYING)
-"""Let the policy go on; complete the sensors at fault and go on; stay and keep the grip, yielding to more than a hold's
-force; give way to what presses; go back along the path; stay, and end the episode."""
+"""Let the policy go on; complete the sensors at fault and go on; let the policy go on for a second at a quarter of the
+speed, with half of the limits on force, however sure the cause is; stay and keep the grip, yielding to more than a
+hold's force; give way to what presses; go back along the path; stay, and end the episode."""
 
 DEFAULT: dict[str, str] = {
     "sensor": "complete",
