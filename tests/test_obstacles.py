@@ -39,6 +39,7 @@ def directions_at(world, place):
     """Return the unit vectors to what is near a hand at a place; None where it is near on all sides."""
     model, data, obstacles = world
     data.mocap_pos[0] = place
+    data.ncon = 0
     mujoco.mj_kinematics(model, data)
     obstacles.look()
     count = obstacles.ahead.counts[0, 0]
@@ -76,9 +77,22 @@ def test_directions_are_those_of_the_nearest_points_that_mujoco_finds(world):
     assert seen > 20
 
 
-def test_things_that_lie_freely_do_not_count(world):
-    assert len(directions_at(world, [0.0, 0.38, 0.5])) == 0
-    assert len(directions_at(world, [0.0, -0.40, 0.5])) == 1
+def test_what_the_hand_touches_is_no_obstacle_and_belongs_to_the_hand(world):
+    model, data, obstacles = world
+    assert len(directions_at(world, [0.0, 0.35, 0.5])) == 1  # 1 cm from the ball
+    data.mocap_pos[0] = [0.0, 0.37, 0.5]
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 1
+    obstacles.look()
+    assert obstacles.ahead.counts[0, 0] == 0
+
+    data.qpos[2] = 0.12  # the ball is 2 cm above the floor, and the hand touches it from above
+    data.mocap_pos[0] = [0.0, 0.5, 0.25]
+    mujoco.mj_forward(model, data)
+    obstacles.look()
+    down = obstacles.ahead.directions[0, 0, :1, :3]
+    assert obstacles.ahead.counts[0, 0] == 1
+    np.testing.assert_allclose(down, [[0, 0, -1]], atol=1e-6)
 
 
 def test_a_hand_within_an_obstacle_is_near_it_on_all_sides(world):

@@ -1,9 +1,8 @@
-"""Where an arm might meet something that does not give way: only towards it is the arm's momentum limited.
+"""Where an arm might meet something: only towards it is the arm's momentum limited.
 
-What does not give way is fixed to the world, as tables, bins and the robot's own pedestal are, or hangs on a joint, as
-doors and other arms do. Things that lie freely do not count: an arm pushes them away, up to what they lie against.
-Around each geom of the arm there is a ball, and around each obstacle a box. The directions to boxes that are within
-``NEAR`` of a ball are noted in every control step, and compared with the motion in every substep.
+Around each geom of the arm there is a ball, and around each geom of anything else a box. The directions to boxes that
+are within ``NEAR`` of a ball are noted in every control step, and compared with the motion in every substep. What the
+hand touches and can be carried belongs to the hand: it is no obstacle, and meets others.
 """
 
 from __future__ import annotations
@@ -26,9 +25,10 @@ Ids = NDArray[np.int64]
 class ArmGeoms(NamedTuple):
     """Geoms that one arm may bring together; arrays of MuJoCo are not copied."""
 
-    links: Ids  # (G,) index of the link that each geom of the arm belongs to, from the hand on
-    geoms: Ids  # (G,)
-    obstacles: Ids  # (O,) other geoms
+    links: Ids  # (ngeom,) index of the link that carries each geom, from the hand on; else -1
+    own: Ids  # (G,) geoms of the arm
+    others: Ids  # (O,) other geoms
+    carriable: NDArray[np.int32]  # (ngeom,) the body that lies freely and has the geom; else -1
     radii: Floats  # (ngeom,) of the ball around each geom [m]
     boxes: Floats  # (ngeom, 6) centre and half edges of the box around each, in its frame [m]
     places: Floats  # (ngeom, 3)
@@ -41,12 +41,12 @@ class ArmGeoms(NamedTuple):
         link_of = np.array([_link_of(model, arms[a], body) for body in range(model.nbody)])
         link_of_geom = link_of[model.geom_bodyid]
         own = np.flatnonzero(collides & (link_of_geom >= 0))
-        gives_way = np.array([_gives_way(model, body) for body in range(model.nbody)])
-        is_obstacle = collides & (link_of_geom < 0) & ~gives_way[model.geom_bodyid]
+        free_bodies = [_free_body(model, body) for body in range(model.nbody)]
         return cls(
-            links=link_of_geom[own],
-            geoms=own,
-            obstacles=np.flatnonzero(is_obstacle),
+            links=link_of_geom,
+            own=own,
+            others=np.flatnonzero(collides & (link_of_geom < 0)),
+            carriable=np.array(free_bodies, np.int32)[model.geom_bodyid],
             radii=model.geom_rbound,
             boxes=model.geom_aabb,
             places=data.geom_xpos,
@@ -67,13 +67,18 @@ class Obstacles:
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, arms: Arms) -> None:
+        self._data = data
+        self._is_carried = np.zeros(model.nbody, np.bool_)
         self._geoms = [ArmGeoms.of(model, data, arms, a) for a in range(len(arms))]
         self.ahead = Ahead.everywhere(len(arms))
 
     def look(self) -> None:
         """Write where the arms are now."""
+        touching = self._data.contact.geom
         for a, geoms in enumerate(self._geoms):
-            note_ahead(geoms, self.ahead.counts[a], self.ahead.directions[a])
+            note_ahead(
+                geoms, touching, self._is_carried, self.ahead.counts[a], self.ahead.directions[a]
+            )
 
 
 def _link_of(model: mujoco.MjModel, arm: Any, body: int) -> int:
@@ -86,38 +91,79 @@ def _link_of(model: mujoco.MjModel, arm: Any, body: int) -> int:
     return -1
 
 
-def _gives_way(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a body lies freely, or belongs to one that does."""
+def _free_body(model: mujoco.MjModel, body: int) -> int:
+    """Return the body that lies freely and carries a body; -1 for none."""
     while body > 0:
         first = model.body_jntadr[body]
         if first >= 0 and model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:
-            return True
+            return body
         body = int(model.body_parentid[body])
-    return False
+    return -1
 
 
 @compiled
-def note_ahead(arm: Any, counts: Ids, directions: Floats) -> None:
-    """Write in which directions the links of an arm, by its ``ArmGeoms``, are near an obstacle."""
+def note_ahead(
+    arm: Any,
+    touching: NDArray[np.int32],
+    is_carried: NDArray[np.bool_],
+    counts: Ids,
+    directions: Floats,
+) -> None:
+    """Write in which directions the links of an arm are near something.
+
+    Args:
+        arm: its ``ArmGeoms``.
+        touching: (N, 2) geoms that touch.
+        is_carried: (nbody,) scratch: the hand touches the body.
+        counts: (MOST_BODIES,) as in ``Ahead``, as are the directions.
+    """
     counts[:] = 0
+    note_carried(arm, touching, is_carried)
+    for geom in arm.own:
+        note_geom(arm, geom, arm.links[geom], is_carried, counts, directions)
+    for geom in arm.others:
+        if arm.carriable[geom] >= 0 and is_carried[arm.carriable[geom]]:
+            note_geom(arm, geom, 0, is_carried, counts, directions)
+
+
+@inner
+def note_carried(arm: Any, touching: NDArray[np.int32], is_carried: NDArray[np.bool_]) -> None:
+    """Write which bodies that lie freely the hand touches."""
+    is_carried[:] = False
+    for n in range(len(touching)):
+        for side in range(2):
+            body = arm.carriable[touching[n, side]]
+            if body >= 0 and arm.links[touching[n, 1 - side]] == 0:
+                is_carried[body] = True
+
+
+@inner
+def note_geom(
+    arm: Any,
+    geom: int,
+    link: int,
+    is_carried: NDArray[np.bool_],
+    counts: Ids,
+    directions: Floats,
+) -> None:
+    """Note the directions in which a geom of a link is near something."""
     way = np.zeros(3)
-    for g in range(len(arm.geoms)):
-        link = arm.links[g]
-        for obstacle in arm.obstacles:
-            if counts[link] == EVERYWHERE:
-                break
-            geom = arm.geoms[g]
-            apart = write_way(arm, geom, obstacle, way)
-            if apart - arm.radii[geom] > NEAR:
-                continue
-            if apart == 0.0 or counts[link] == DIRECTIONS:
-                counts[link] = EVERYWHERE
-                break
-            direction = directions[link, counts[link]]
-            for axis in range(3):
-                direction[axis] = way[axis] / apart
-            direction[3] = arm.radii[geom]
-            counts[link] += 1
+    for other in arm.others:
+        if counts[link] == EVERYWHERE:
+            return
+        if arm.carriable[other] >= 0 and is_carried[arm.carriable[other]]:
+            continue
+        apart = write_way(arm, geom, other, way)
+        if apart - arm.radii[geom] > NEAR:
+            continue
+        if apart == 0.0 or counts[link] == DIRECTIONS:
+            counts[link] = EVERYWHERE
+            return
+        direction = directions[link, counts[link]]
+        for axis in range(3):
+            direction[axis] = way[axis] / apart
+        direction[3] = arm.radii[geom]
+        counts[link] += 1
 
 
 @inner
