@@ -32,7 +32,14 @@ from asm_gym.memory.association_learning import (
     thirds,
 )
 from asm_gym.memory.linear_association import LEAST_VARIANCE, conditional, inverse_of, moments
-from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
+from asm_gym.memory.recurrent import (
+    Eligibility,
+    Errors,
+    RecurrentWeights,
+    initial_recurrent_weights,
+    local_change,
+)
+from asm_gym.memory.recurrent import Wiring as RecurrentWiring
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scaling import ScaledRows
 from tests.problems import CHANGES, called, energy
@@ -68,11 +75,12 @@ def test_no_group_predicts_itself():
 def test_all_rules_of_the_memory_descend_one_energy():
     rng = np.random.default_rng(3)
     B, H, S, A, units, inputs = 4, 6, 5, 2, 7, 13
-    w = initial_weights(H, S, A, rng)
+    w = initial_recurrent_weights(H, S, A, rng)
+    wiring = RecurrentWiring.of(w)
     W = {
         "W_C": w.W_C,
         "W_F": 3 * w.W_F,
-        "W_D": 0.1 * rng.normal(size=w.W_D.shape) * direct_synapses(S, A),
+        "W_D": 0.1 * rng.normal(size=w.W_D.shape) * wiring.W_D,
     }
     W |= {
         "V": rng.normal(size=(units, inputs)),
@@ -98,9 +106,19 @@ def test_all_rules_of_the_memory_descend_one_energy():
         return float(np.mean(temporal) + np.mean(np.sum(spread * rho, axis=1)))
 
     settled = left(W) - np.tanh(z) @ W["W_F"].T
-    rules = hebbian_change(c, u, c @ W["W_C"].T, z, settled, 30.0)._asdict()
+    weights = RecurrentWeights._make(array.astype(np.float64) for array in w)
+    weights = weights._replace(**{name: W[name] for name in ("W_C", "W_F", "W_D")})
+    rules = local_change(
+        m=c,
+        u=u,
+        z=z,
+        errors=Errors(30.0 * (z - c @ W["W_C"].T), settled),
+        eligible=Eligibility.none(B, weights),
+        weights=weights,
+        wiring=wiring,
+    )._asdict()
     rules |= association_change(a, delta, spread, W["V"], W["U"], W["D"])[0]._asdict()
-    exists = {"W_D": direct_synapses(S, A)}
+    exists = {"W_D": wiring.W_D}
     for name, array in W.items():
         for index in zip(*(rng.integers(n, size=6) for n in array.shape), strict=True):
             if not exists.get(name, np.ones(array.shape))[index]:

@@ -126,3 +126,9 @@ def test_a_file_of_an_older_version_is_refused_with_what_makes_it_anew(asm, tmp_
         NeuralASM.load(
             tampered(asm, tmp_path / "m.asm", {"W_C.planesf4": np.zeros((4, 8), np.uint8)})
         )
+    with pytest.raises(ValueError, match=r"unknown dynamics 'traces'.*make it anew with asm-gym"):
+        NeuralASM.load(
+            tampered(
+                asm, tmp_path / "m.asm", hyperparameters=asm.get_params() | {"dynamics": "traces"}
+            )
+        )

@@ -37,11 +37,11 @@ def expected_by(asm, state, rows):
     network, lag = model.network, model.lag
     reading = model.senses_.read(rows, *history.past(rows))
     due = history.steps % lag == 0
-    traces, expected = state.traces.copy(), state.expected.copy()
+    carried, expected = state.carried.copy(), state.expected.copy()
     if due.any():
         read = reading.commands[due], reading.senses[due], reading.seen[due]
-        step = network.follow(traces[due], *read)
-        expected[due], traces[due] = activate(step.mu), step.traces
+        step = network.follow(carried[due], *read)
+        expected[due], carried[due] = activate(step.mu), step.carried
     a = network.association
     units = np.tanh(reading.inputs @ a.V.T)
     spread = np.clip(units @ a.W_S.T + a.b_S, *a.span_S)
@@ -56,7 +56,7 @@ def expected_by(asm, state, rows):
     if asm.skills_:
         p = certainty(np.hstack([units, expected]), model.learned_["W_K"], model.learned_["b_K"])
         skill = KEPT * skill + np.log(p + SMALLEST)
-    return errors, MemoryState(traces, expected, history.followed_by(rows), skill)
+    return errors, MemoryState(carried, expected, history.followed_by(rows), skill)
 
 
 def leverages(R, inputs, senses):
@@ -164,7 +164,7 @@ def test_one_call_gives_what_the_equations_give(dt, batch):
         both(asm, rows[:, first : first + batch], asm.initial_state(batch))
 
 
-@pytest.mark.parametrize("dynamics", ["traces", "settling", "recurrent"])
+@pytest.mark.parametrize("dynamics", ["settling", "recurrent"])
 def test_streams_that_began_at_different_times_and_named_skills_make_no_difference(dynamics):
     asm, rows, episodes = memory(0.01, dynamics=dynamics)
     name_skills(

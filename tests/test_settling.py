@@ -124,7 +124,7 @@ def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
         u = np.append(small * rng.normal(size=1), 0.0)[None]
         z = net.follow(
             z, u.astype(np.float32), x.astype(np.float32), np.ones((1, 3), np.float32)
-        ).traces
+        ).carried
         mu = state @ w.W_H.T + u @ w.W_U.T
         state = mu + (x - mu @ C.T) @ K.T
         np.testing.assert_allclose(z, state, atol=1e-3 * small)
@@ -212,7 +212,7 @@ def test_inference_and_both_recalls_are_those_of_the_published_equations(seed):
         expected.append(np.hstack([theirs.senses(mu), theirs.action(z)]))
         z = after
     online = follow(ours, np.zeros((3, H)), senses, commands)
-    np.testing.assert_allclose(online.traces, z, atol=1e-6)
+    np.testing.assert_allclose(online.carried, z, atol=1e-6)
     np.testing.assert_allclose(np.dstack([online.senses, online.commands]), expected, atol=1e-6)
     expected = []
     for _ in range(6):  # the network's own predictions stand in for senses and actions
@@ -221,7 +221,7 @@ def test_inference_and_both_recalls_are_those_of_the_published_equations(seed):
         np.testing.assert_allclose(after, mu, atol=1e-9)  # nothing is left to infer
         expected.append(np.hstack([theirs.senses(mu), u[:, :-1]]))
         z = after
-    offline = run_on(ours, online.traces, 6)
+    offline = run_on(ours, online.carried, 6)
     np.testing.assert_allclose(np.dstack([offline.senses, offline.commands]), expected, atol=2e-6)
 
 
@@ -293,7 +293,7 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
 def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     with pytest.raises(
         ValueError,
-        match=r"^unknown dynamics 'setling'; known: recurrent, traces, settling; did you mean",
+        match=r"^unknown dynamics 'setling'; known: recurrent, settling; did you mean",
     ):
         NeuralASM(sine_spec(), dynamics="setling")
     with pytest.raises(
@@ -307,12 +307,12 @@ def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
         match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'recurrent'$",
     ):
         NeuralASM(sine_spec(), 32, 48).restore(saved)
-    traces = NeuralASM(sine_spec(), 8, 8, epochs=1, dynamics="traces").fit(sine_episodes(5))
-    traces.save(tmp_path / "traces.asm")
+    recurrent = NeuralASM(sine_spec(), 8, 8, epochs=1).fit(sine_episodes(5))
+    recurrent.save(tmp_path / "recurrent.asm")
     with pytest.raises(
         ValueError,
-        match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$",
+        match=r"^this is a memory of dynamics='recurrent', .* cannot be loaded as 'settling'$",
     ):
         NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(
-            read_checkpoint(tmp_path / "traces.asm", traces.kind)
+            read_checkpoint(tmp_path / "recurrent.asm", recurrent.kind)
         )

@@ -1,4 +1,4 @@
-"""The temporal network by traces: inference, learning, recall and readout, against their oracles."""
+"""The temporal network: inference, learning, recall and readout, against their oracles."""
 
 from __future__ import annotations
 
@@ -27,16 +27,15 @@ from asm_gym.memory.learning import (
     one_after_another,
 )
 from asm_gym.memory.recall import follow, run_on
-from asm_gym.memory.temporal import unassociated
-from asm_gym.memory.traces import (
-    DECAYS,
-    Network,
-    TracesLearner,
+from asm_gym.memory.recurrent import (
+    RecurrentLearner,
+    RecurrentNetwork,
+    Wiring,
     advance,
-    direct_synapses,
-    initial_weights,
-    learn_traces,
+    initial_recurrent_weights,
+    learn_recurrent,
 )
+from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import MemoryConfig, NeuralASM
 from asm_gym.monitors.memory_skills import recall
 from tests.problems import called, energy, problem, schedule, some_rows, trajectory
@@ -100,16 +99,20 @@ def test_inference_is_gradient_descent_that_unseen_senses_do_not_move():
     assert a.tobytes() == b.tobytes()
 
 
-def test_a_trace_is_the_exponentially_weighted_sum_of_all_rows():
+def test_a_unit_is_the_exponentially_weighted_sum_of_all_rows():
     rng = np.random.default_rng(0)
-    rows = rng.normal(size=(30, 2, 3)).astype(np.float32)
-    gains = rng.uniform(0.1, 1.0, len(DECAYS)).astype(np.float32)
-    traces = np.zeros((2, 3 * len(DECAYS)), np.float32)
+    rows = rng.normal(size=(30, 2, S + A + 1)).astype(np.float32)
+    weights = initial_recurrent_weights(H, S, A, rng)
+    weights.reads[1] = 0.0
+    carried = np.zeros((2, weights.W_C.shape[1]), np.float32)
     for row in rows:
-        traces = advance(traces, row, gains)
-    weights = DECAYS[:, None].astype(float) ** np.arange(len(rows))[::-1]  # (K, T); 0⁰ is 1
-    expected = np.einsum("kt,tbr->bkr", weights, rows) * gains[:, None]
-    np.testing.assert_allclose(traces, expected.reshape(2, -1), atol=1e-4)
+        carried = advance(carried, row, weights)
+    multiplier = np.exp(-np.exp(weights.decay.astype(float)) + 1j * weights.turn)  # (N,)
+    powers = multiplier[:, None] ** np.arange(len(rows))[::-1]  # (N, T)
+    drive = (rows * weights.reads) @ (weights.B_re + 1j * weights.B_im).T  # (T, B, N)
+    units = np.einsum("nt,tbn->bn", powers, drive) * weights.gain
+    expected = np.hstack([units.real, units.imag, rows[-1]])
+    np.testing.assert_allclose(carried, expected, atol=1e-4)
 
 
 def test_a_synapse_steps_as_adam_does_along_a_cosine():
@@ -138,7 +141,7 @@ def sines(count: int, motor: int = 2) -> list[Trajectory]:
 def test_learning_lowers_the_energy_and_is_reproducible():
     episodes = sines(12)
     first, again = (
-        learn_traces(episodes, 32, schedule(epochs=15), np.random.default_rng(7), lambda: None)
+        learn_recurrent(episodes, 32, schedule(epochs=60), np.random.default_rng(7), lambda: None)
         for _ in range(2)
     )
     assert first.energy[-1] < 0.6 * first.energy[0]  # two of seven numbers are noise
@@ -154,7 +157,7 @@ def test_a_bit_that_was_seen_long_ago_is_recalled():
         senses[0, 0], senses[delay:, 1] = (1.0 if n % 2 else -1.0,) * 2
         episodes.append(trajectory(senses.astype(np.float32), np.ones((delay + 4, 1), np.float32)))
     how = schedule(epochs=100, batch_size=8, learning_rate=5e-3, prior_precision=30.0)
-    network, right = learn_traces(episodes, 32, how, rng, lambda: None).network, []
+    network, right = learn_recurrent(episodes, 32, how, rng, lambda: None).network, []
     for episode in episodes:
         cued = follow(
             network,
@@ -162,27 +165,27 @@ def test_a_bit_that_was_seen_long_ago_is_recalled():
             episode.senses[:delay, None],
             episode.commands[:delay, None],
         )
-        right.append(run_on(network, cued.traces, 1).senses[0, 0, 1] * episode.senses[0, 0])
+        right.append(run_on(network, cued.carried, 1).senses[0, 0, 1] * episode.senses[0, 0])
     assert min(right) > 0
     assert np.mean(right) > 0.4
 
 
-def network(scale: float = 1.0, iterations: int = 20) -> Network:
+def network(scale: float = 1.0, iterations: int = 20) -> RecurrentNetwork:
     rng = np.random.default_rng(0)
-    weights = initial_weights(H, S, A, rng)
+    weights = initial_recurrent_weights(H, S, A, rng)
     weights.W_F[:] = scale * rng.normal(size=weights.W_F.shape)
-    weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(S, A)
-    return Network(weights, unassociated(), iterations, 1.0, 1.0)
+    weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * Wiring.of(weights).W_D
+    return RecurrentNetwork(weights, unassociated(), iterations, 1.0, 1.0)
 
 
 def test_running_on_is_following_the_own_predictions():
     net, (senses, commands) = network(scale=0.3, iterations=50), some_rows(5, 3, S, A)
-    c = follow(net, net.at_rest(3), senses, commands).traces
+    c = follow(net, net.at_rest(3), senses, commands).carried
     alone = run_on(net, c, 8)
     fed_back = np.concatenate([alone.commands, np.ones((8, 3, 1), np.float32)], axis=2)
     along = follow(net, c, alone.senses, fed_back)
     np.testing.assert_allclose(along.senses, alone.senses, atol=1e-3)
-    np.testing.assert_allclose(along.traces, alone.traces, atol=1e-3)
+    np.testing.assert_allclose(along.carried, alone.carried, atol=1e-3)
 
 
 def test_a_missing_sense_is_inferred_from_the_others():
@@ -190,15 +193,14 @@ def test_a_missing_sense_is_inferred_from_the_others():
     rng = np.random.default_rng(0)
     rows = rng.choice([-1.0, 1.0], size=(40, 30, 1)).repeat(2, axis=2).astype(np.float32)
     episodes = [Trajectory(r, np.ones((30, 1), np.float32), r) for r in rows]
-    net = learn_traces(
+    net = learn_recurrent(
         episodes, 16, schedule(epochs=40, batch_size=8), rng, lambda: None
     ).network.with_iterations(50)
     for r in rows[:20]:
         step = net.follow(
             net.at_rest(1), np.ones((1, 1), np.float32), r[:1], np.array([[1.0, 0.0]], np.float32)
         )
-        # the fastest trace is the row itself
-        assert step.traces.reshape(len(DECAYS), 3)[0, 1] * r[0, 1] > 0
+        assert step.senses[0, 1] * r[0, 1] > 0
 
 
 def phases(count: int) -> list[Trajectory]:
@@ -210,19 +212,23 @@ def phases(count: int) -> list[Trajectory]:
 
 
 @pytest.mark.parametrize("free", [0.0, 1.0])
-def test_after_the_cue_the_traces_take_up_predictions(free):
+def test_after_the_cue_what_is_carried_takes_up_predictions(free):
     episode, weights, rng = phases(1)[0], network().weights, np.random.default_rng(0)
-    streams = Practice(TracesLearner(weights, schedule(iterations=20), rng), 1, rng)
+    streams = Practice(
+        RecurrentLearner(weights, schedule(batch_size=1, iterations=20), rng), 1, rng
+    )
     moments = one_after_another([episode], 1, np.random.default_rng(0))
     streams.run([next(m for m in moments if m.begins.all())], 0.0, free)
     length = int(streams.cue[0, 0])
     assert 1 <= length < LONGEST_CUE
     streams.run(itertools.islice(moments, len(episode.senses) - 1), 0.0, free)
-    net = Network(weights, unassociated(), 20, 1.0, 1.0)
+    net = RecurrentNetwork(weights, unassociated(), 20, 1.0, 1.0)
     read = len(episode.senses) if free == 0.0 else length
     cued = follow(net, net.at_rest(1), episode.senses[:read, None], episode.commands[:read, None])
-    traces = run_on(net, cued.traces, len(episode.senses) - read).traces if free else cued.traces
-    np.testing.assert_allclose(streams.state, traces, rtol=1e-3, atol=1e-3)
+    carried = cued.carried
+    if free:
+        carried = run_on(net, carried, len(episode.senses) - read).carried
+    np.testing.assert_allclose(streams.state, carried, rtol=1e-3, atol=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What is predicted from what a network carries on; shared by ``recurrent`` and ``traces``.
+"""What is predicted from what a network carries on, as ``recurrent`` does.
 
     μ_t = W_C m_{t-1}                                expected state; z_t is inferred from it (``energy``)
     [x̂_t, â_t] = W_F f(z_t) + W_D [m_{t-1}, a_t, 1]  prediction from a state; â has no synapse from the action itself

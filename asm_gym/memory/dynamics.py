@@ -1,7 +1,6 @@
 """The temporal networks by name, and the training of a whole memory.
 
     recurrent   units that learn how long to remember are carried on, and the state follows from them
-    traces      traces of senses and actions are carried on, and the state follows from them
     settling    the state is carried on by learned synapses, and is inferred on every row
 
 Every synapse descends its own term of
@@ -37,11 +36,12 @@ from asm_gym.memory.settling import (
     settling_shapes,
 )
 from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
-from asm_gym.memory.traces import Network, Weights, learn_traces, weight_shapes
 
 RECURRENT = "recurrent"
-TRACES = "traces"
 SETTLING = "settling"
+
+ITERATIONS = 20  # most steps of inference, by default
+PRIOR_PRECISION = 1.0  # Π_z, by default
 
 
 class Dynamics(NamedTuple):
@@ -53,8 +53,6 @@ class Dynamics(NamedTuple):
     weights: Callable[..., Any]  # the record of its weights, built by keywords
     network: Callable[..., TemporalNetwork]
     learn: Learn
-    iterations: int  # default
-    prior_precision: float  # default
 
 
 DYNAMICS = {
@@ -63,24 +61,12 @@ DYNAMICS = {
         weights=RecurrentWeights,
         network=RecurrentNetwork,
         learn=learn_recurrent,
-        iterations=20,
-        prior_precision=1.0,
-    ),
-    TRACES: Dynamics(
-        shapes=weight_shapes,
-        weights=Weights,
-        network=Network,
-        learn=learn_traces,
-        iterations=5,
-        prior_precision=30.0,
     ),
     SETTLING: Dynamics(
         shapes=settling_shapes,
         weights=SettlingWeights,
         network=SettlingNetwork,
         learn=learn_settling,
-        iterations=20,
-        prior_precision=1.0,
     ),
 }
 
@@ -89,9 +75,7 @@ def dynamics_of(names: Collection[str]) -> str:
     """Return the dynamics whose arrays have these names."""
     if "W_H" in names:
         return SETTLING
-    if "B_re" in names:
-        return RECURRENT
-    return TRACES
+    return RECURRENT
 
 
 def train(

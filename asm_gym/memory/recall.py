@@ -28,7 +28,7 @@ class Recalled(NamedTuple):
 
     senses: Array  # (T, B, S) x̂_t, before x_t was sensed
     commands: Array  # (T, B, A) â_t, before a_t was commanded
-    traces: Array  # (B, I) c_T, to carry on with
+    carried: Array  # (B, I) c_T, to carry on with
 
 
 def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -> Recalled:
@@ -39,7 +39,7 @@ def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -
         known = np.where(seen, x, np.float32(0))
         step = network.follow(c, u, known, seen.astype(np.float32))
         steps.append(step)
-        c = step.traces
+        c = step.carried
     return _stacked(steps, network)
 
 
@@ -49,7 +49,7 @@ def run_on(network: TemporalNetwork, c: Array, steps: int) -> Recalled:
     for _ in range(steps):
         step = network.run_on(c)
         recalled.append(step)
-        c = step.traces
+        c = step.carried
     return _stacked(recalled, network)
 
 
@@ -74,7 +74,7 @@ def continued(
     senses = reading.senses.reshape(-1, lag, reading.senses.shape[1])
     commands = reading.commands.reshape(-1, lag, reading.commands.shape[1])
     cued = follow(network, network.at_rest(lag), senses, commands)
-    recalled = run_on(network, cued.traces, -(-steps // lag))
+    recalled = run_on(network, cued.carried, -(-steps // lag))
     return to_rows(reader, recalled).reshape(-1, reader.spec.size)[:steps]
 
 
@@ -102,4 +102,4 @@ def check_cue(
 def _stacked(steps: Sequence[Step], network: TemporalNetwork) -> Recalled:
     expected = np.stack([s.expected for s in steps])
     S = expected.shape[2] - network.motor
-    return Recalled(expected[:, :, :S], expected[:, :, S:], steps[-1].traces)
+    return Recalled(expected[:, :, :S], expected[:, :, S:], steps[-1].carried)

@@ -1,6 +1,6 @@
-"""What every temporal network does, by ``traces`` or by a state that settles (``settling``).
+"""What every temporal network does, by ``recurrent`` units or by a state that settles (``settling``).
 
-time          c_{t-1} → μ_t → z_t → c_t    c: traces, or z itself
+time          c_{t-1} → μ_t → z_t → c_t    c: what is carried on: units and the last row, or z itself
 association   a_t → Δ̂_t, σ_t               beside it, the same for both; they share rows and no state
 
 Association compares each row with that of l rows before, so that l rows and those before them are kept; the network
@@ -66,7 +66,7 @@ class MemoryState(NamedTuple):
     """State of the memory, one entry a stream; never changed in place."""
 
     # (B, I) c, of what was sensed and done; or the state z that settled on it
-    traces: NDArray[np.float32]
+    carried: NDArray[np.float32]
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
     history: RowHistory
     skill: NDArray[np.float32]  # (B, K) L, evidence for each skill; K is 0 where none has a name
@@ -78,7 +78,7 @@ class Step(NamedTuple):
     mu: Array  # (B, H) the state expected before it was read
     expected: Array  # (B, S + A) x̂_t and â_t, expected then
     z: Array  # (B, H) the inferred state
-    traces: Array  # (B, I) c_t, the new carried state; missing senses in it are completed
+    carried: Array  # (B, I) c_t, the new carried state; missing senses in it are completed
     senses: Array  # (B, S) what was sensed; what was missing is inferred
 
 

@@ -163,7 +163,7 @@ class MemoryModel(ScaledModel):
 
     def start(self, batch: int) -> MemoryState:
         return MemoryState(
-            traces=self.network.at_rest(batch),
+            carried=self.network.at_rest(batch),
             expected=np.zeros((batch, self.network.hidden_size), np.float32),
             history=super().start(batch),
             skill=np.zeros((batch, len(self.skills_)), np.float32),
@@ -183,7 +183,7 @@ class MemoryModel(ScaledModel):
         if self.motor_ is not None:
             last_rows = state.history.before[:, -1]
             return self.motor_.command(situation(senses, last_rows))
-        expected = self.network.run_on(state.traces).expected
+        expected = self.network.run_on(state.carried).expected
         motor = self.spec.motor
         is_action = np.isin(self.spec.commanded, motor)
         standard = expected[:, senses.size :][:, is_action]

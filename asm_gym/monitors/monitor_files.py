@@ -124,7 +124,15 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> A
     """Return a checkpoint's monitor, which ``make(spec, **hyperparameters)`` makes. Raises DamagedFile."""
     try:
         spec = StreamSpec.from_json(saved.header["spec"])
-        return make(spec, **saved.header["hyperparameters"]).restore(saved)
+        monitor = make(spec, **saved.header["hyperparameters"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _foreign(path, error) from error
+    try:
+        return monitor.restore(saved)
     except (KeyError, TypeError) as error:
-        problem = f"{error}, or it was written by an older version: make it anew with asm-gym fit"
-        raise DamagedFile(path, problem) from error
+        raise _foreign(path, error) from error
+
+
+def _foreign(path: str | Path, error: Exception) -> DamagedFile:
+    problem = f"{error}, or it was written by an older version: make it anew with asm-gym fit"
+    return DamagedFile(path, problem)

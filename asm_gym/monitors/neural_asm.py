@@ -68,7 +68,7 @@ class NeuralASM(CalibratedMonitor):
             a memory that watches any policy.
         dynamics: how the temporal network represents the past: ``"recurrent"``, by units that learn how long they
             remember, or ``"settling"``, the temporal predictive coding network of the papers, whose state is inferred
-            on every row. ``"traces"``, with fixed decays, is that of memories from earlier versions.
+            on every row.
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
         values: judge values, such as torques, beside changes (``monitors.torque``), if other senses predict them: for
@@ -116,8 +116,7 @@ class NeuralASM(CalibratedMonitor):
         config: MemoryConfig | None = None,
     ) -> None:
         check_choice("dynamics", dynamics, DYNAMICS)
-        config = config or MemoryConfig()
-        self.config = config.with_defaults_of(DYNAMICS[dynamics])
+        self.config = config or MemoryConfig()
         self.dynamics = dynamics
         self.urdf = urdf
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
@@ -140,7 +139,7 @@ class NeuralASM(CalibratedMonitor):
         ArmFeatures.of(spec, urdf)  # refuses a body model of another arm
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
-        evidence_params = {name: getattr(config, name) for name in OF_EVIDENCE}
+        evidence_params = {name: getattr(self.config, name) for name in OF_EVIDENCE}
         evidence = EvidenceDetection(spec, habituates=habituates, **evidence_params)
         self.config = self.config.as_checked_by(evidence)
         self.habituates = evidence.habituates

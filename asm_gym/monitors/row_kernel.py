@@ -37,13 +37,11 @@ from asm_gym.memory.readout import add_up
 from asm_gym.memory.recurrent import RecurrentWeights, recurrent_shapes, remember
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
-from asm_gym.memory.traces import Weights, carry, weight_shapes
 from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.monitor_state import MonitorState
 from asm_gym.scaling import RowScale, ScaledRows, StreamScaler, read_rows
 
 KINDS_OF_WEIGHTS: dict[Any, Any] = {
-    Weights: weight_shapes,
     SettlingWeights: settling_shapes,
     RecurrentWeights: recurrent_shapes,
 }
@@ -54,10 +52,9 @@ STATE_ARRAYS = 14  # of ``arrays_of``
 class RowWeights(NamedTuple):
     """The learned numbers of a memory, as compiled code reads them."""
 
-    traces: Weights
     settling: SettlingWeights
     recurrent: RecurrentWeights
-    dynamics: int  # which of the three the temporal network has, the others being 0
+    settles: bool  # the temporal network settles; the weights of the other kind are 0
     association: Association
     wiring: Wiring
     W_K: NDArray[np.float32]  # (K, M + H) from units and context to the evidence for each skill
@@ -77,10 +74,9 @@ def row_weights(
     kind: Any = type(network.weights)
     used = unused | {kind: kind._make(map(single, network.weights))}
     return RowWeights(
-        traces=used[Weights],
         settling=used[SettlingWeights],
         recurrent=used[RecurrentWeights],
-        dynamics=list(KINDS_OF_WEIGHTS).index(kind),
+        settles=kind is SettlingWeights,
         association=Association._make(map(single, network.association)),
         wiring=Wiring.of(network.association, scaler),
         W_K=single(learned.get("W_K", np.zeros((0, 0)))),
@@ -179,7 +175,7 @@ def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
     memory = state.model
     detection = state.detection
     return [
-        memory.traces,
+        memory.carried,
         memory.expected,
         memory.skill,
         *memory.history,
@@ -192,12 +188,12 @@ def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
 @inner
 def state_of(arrays: Any) -> MonitorState:
     """Return the state of ``STATE_ARRAYS`` arrays, in the order of ``arrays_of``."""
-    traces, expected, skill = arrays[:3]
+    carried, expected, skill = arrays[:3]
     history = RowHistory(arrays[3], arrays[4], arrays[5])
     evidence = Evidence(arrays[6], arrays[7], arrays[8])
     repetition = Repetition(arrays[9], arrays[10], arrays[11])
     return MonitorState(
-        model=MemoryState(traces, expected, history, skill),
+        model=MemoryState(carried, expected, history, skill),
         detection=EvidenceState(evidence, repetition),
         excuses=EventState(arrays[12], arrays[13]),
         values=(),
@@ -325,7 +321,7 @@ def carry_on(
     reading: ScaledRows,
     wants_context: bool,
 ) -> None:
-    """Write traces and expected state of every stream.
+    """Write carried and expected state of every stream.
 
     The temporal network takes up every l-th row of a stream; at the others both stay.
     """
@@ -334,24 +330,24 @@ def carry_on(
     any_due = False
     for n in range(len(steps)):
         any_due = any_due or steps[n] % lag == 0
-        copy(before.traces[n], after.traces[n])
+        copy(before.carried[n], after.carried[n])
         copy(before.expected[n], after.expected[n])
     if any_due:
-        expected, carried = follow(weights, before.traces, reading, wants_context)  # of all streams
+        expected, carried = follow(
+            weights, before.carried, reading, wants_context
+        )  # of all streams
         for n in range(len(steps)):
             if steps[n] % lag == 0:
-                copy(carried[n], after.traces[n])
+                copy(carried[n], after.carried[n])
                 copy(expected[n], after.expected[n])
 
 
 @partial(inner, inlined=True)
-def follow(weights: RowWeights, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
-    """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
-    if weights.dynamics == 1:
-        return settle(traces, reading, weights.settling, weights.inference)
-    if weights.dynamics == 2:
-        return remember(traces, reading, weights.recurrent, weights.inference, wants_context)
-    return carry(traces, reading, weights.traces, weights.inference, wants_context)
+def follow(weights: RowWeights, carried: Any, reading: ScaledRows, wants_context: bool) -> Any:
+    """Return f(μ_t) (B, H) and the new carried state c_t (B, I)."""
+    if weights.settles:
+        return settle(carried, reading, weights.settling, weights.inference)
+    return remember(carried, reading, weights.recurrent, weights.inference, wants_context)
 
 
 @partial(inner, inlined=True)

@@ -17,7 +17,7 @@ from asm_gym.detection.base import Arrays
 
 BITS = ".bits"  # ends of the names of packed arrays: k (P, Q), and s (P, 1)
 SCALE = ".scale"
-WEIGHTS = ("V", "U", "W_S", "W_C", "W_D", "W_F")  # of association and of the traces' network
+WEIGHTS = ("V", "U", "W_S", "W_C", "W_D", "W_F")  # of association and of the temporal network
 LARGEST_K = 127
 SCALE_BITS = 10
 ROUNDING = 1e-9  # of a quotient that should be whole

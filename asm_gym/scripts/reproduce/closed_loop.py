@@ -94,7 +94,7 @@ class LocalNetwork(SurprisedModel):
         is_first = not self.rows
         scaled = self._read(row)
         step = self.network.follow(self.c, scaled.commands, scaled.senses, scaled.seen)
-        self.c = step.traces
+        self.c = step.carried
         state = np.tanh(step.mu[0])
 
         difference = values_of(scaled) - step.expected[0]

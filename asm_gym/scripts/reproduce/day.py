@@ -58,7 +58,6 @@ SPEC = StreamSpec(
 )
 # A small memory learns such repeated work in a minute.
 SMALL: dict[str, Any] = {
-    "dynamics": "traces",
     "hidden_size": 64,
     "association_size": 160,
     "epochs": 10,

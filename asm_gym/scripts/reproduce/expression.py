@@ -8,17 +8,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
-from asm_gym.memory.dynamics import DYNAMICS, TRACES
+from asm_gym.memory.dynamics import DYNAMICS, ITERATIONS, PRIOR_PRECISION, RECURRENT
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
-from asm_gym.memory.traces import learn_traces
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import backpropagation
 from asm_gym.scripts.reproduce.backpropagation import Batch, Training, side_by_side
@@ -56,10 +54,8 @@ class LocalTraining:
     steps: int = 16000
     # learning rate
     rate: float = 3e-3
-    # gain of the initial synapses from traces to the state
-    gain: float = 1.0
     # one of ``DYNAMICS``
-    dynamics: str = TRACES
+    dynamics: str = RECURRENT
     # probability that a stream runs on alone in training, at the end
     free_running: float = FREE
     # noise on what recurrent units carry on in training
@@ -68,13 +64,12 @@ class LocalTraining:
 
 def schedule_of(settings: LocalTraining, rows: int) -> Schedule:
     """Return the schedule of a network that learns from so many rows."""
-    dynamics = DYNAMICS[settings.dynamics]
     return Schedule(
         epochs=max(1, round(settings.steps * BATCH / rows)),
         batch_size=BATCH,
         learning_rate=settings.rate,
-        iterations=dynamics.iterations,
-        prior_precision=dynamics.prior_precision,
+        iterations=ITERATIONS,
+        prior_precision=PRIOR_PRECISION,
         sensory_precision=1.0,
         free_running_probability=settings.free_running,
         noise=settings.noise,
@@ -108,8 +103,6 @@ class ExpressionMemory(Expresser):
         reader = fit_reader(episodes)
         schedule = schedule_of(settings, sum(map(len, episodes)))
         learn = DYNAMICS[settings.dynamics].learn
-        if settings.dynamics == TRACES:
-            learn = partial(learn_traces, gain=settings.gain)
         taught = trajectories(reader, episodes)
         trained = learn(taught, settings.hidden, schedule, rng, lambda: None)
         return cls(reader, trained.network)
@@ -120,11 +113,11 @@ class ExpressionMemory(Expresser):
         cued = follow(self.network, at_rest, senses[:cue], commands[:cue])
         if cue == len(senses):
             return cued
-        alone = run_on(self.network, cued.traces, len(senses) - cue)
+        alone = run_on(self.network, cued.carried, len(senses) - cue)
         return Recalled(
             senses=np.concatenate([cued.senses, alone.senses]),
             commands=np.concatenate([cued.commands, alone.commands]),
-            traces=alone.traces,
+            carried=alone.carried,
         )
 
 
@@ -141,7 +134,7 @@ class Backpropagated(Expresser):
 
     def expect(self, batch: Batch, cue: int) -> Recalled:
         senses, commands = backpropagation.expected(self.network, batch, cue)
-        return Recalled(senses, commands, traces=commands[-1])
+        return Recalled(senses, commands, carried=commands[-1])
 
 
 def skills_of(episodes: Sequence[Episode]) -> NDArray[np.str_]:

@@ -1,8 +1,8 @@
 """Memorise and recall: one network learns a repertoire without labels, and expresses each skill from a cue.
 
 Claim: local rules recall letters about as well as networks trained by backpropagation through time. Compared are the
-network of recurrent units with as many weights as a GRU and with four times its units; the network by traces with as
-many units and with four times as many; the settling network with as many weights, and as the papers set it; the GRU.
+network of recurrent units with as many weights as a GRU and with four times its units; the settling network with as
+many weights, and as the papers set it; the GRU.
 Online, every row is read after it was predicted; offline, none after the cue. The settings of each were chosen by the
 same search of nine, on letters of seed 100, which is not among those reported; those of the papers are their own.
 
@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from asm_gym.data.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
-from asm_gym.memory.dynamics import DYNAMICS, RECURRENT, SETTLING
+from asm_gym.memory.dynamics import ITERATIONS, PRIOR_PRECISION, SETTLING
 from asm_gym.memory.learning import Moment, Practice, Schedule
 from asm_gym.memory.settling import SettlingLearner, SettlingNetwork, initial_settling_weights
 from asm_gym.memory.temporal import unassociated
@@ -47,20 +47,16 @@ from asm_gym.validation import check_number
 MODELS = {
     "recurrent": "recurrent, local",
     "recurrent_wide": "recurrent, local, 4 × the units",
-    "memory": "traces, local",
-    "memory_wide": "traces, local, 4 × the units",
     "settling": "settling, local",
     "published": "settling, as published, 480 units",
     "gru": "GRU, BPTT",
 }
-UNITS = {"recurrent": 1.875, "recurrent_wide": 4.0, "memory_wide": 4.0, "settling": 1.75}
-"""Units for each of a GRU's. A GRU of 64 has 13,700 weights; these then have 13,700, 55,300, 11,400 and 13,300."""
-AGAINST_NOISE = LocalTraining(rate=3e-3, dynamics=RECURRENT, free_running=0.0, noise=0.3)
+UNITS = {"recurrent": 1.875, "recurrent_wide": 4.0, "settling": 1.75}
+"""Units for each of a GRU's. A GRU of 64 has 13,700 weights; these then have 13,700, 55,300 and 13,300."""
+AGAINST_NOISE = LocalTraining(rate=3e-3, free_running=0.0, noise=0.3)
 LOCAL = {
     "recurrent": AGAINST_NOISE,
     "recurrent_wide": AGAINST_NOISE,
-    "memory": LocalTraining(rate=1e-2, gain=4.0),
-    "memory_wide": LocalTraining(rate=6e-3, gain=8.0),
     "settling": LocalTraining(rate=3e-3, dynamics=SETTLING),
 }
 BACKPROPAGATION = Training(rate=6e-2, noise=0.3)
@@ -196,13 +192,12 @@ def as_published(
     begins = np.zeros((len(batch.senses), len(train), 1), np.bool_)
     begins[0] = True
     moments = list(map(Moment, batch.senses, batch.commands, begins))
-    settling = DYNAMICS[SETTLING]
     schedule = Schedule(
         epochs=epochs,
         batch_size=len(train),
         learning_rate=PUBLISHED_RATE,
-        iterations=settling.iterations,
-        prior_precision=settling.prior_precision,
+        iterations=ITERATIONS,
+        prior_precision=PRIOR_PRECISION,
         sensory_precision=1.0,
         free_running_probability=0.0,
     )

@@ -251,7 +251,7 @@ def completion_error(network: TemporalNetwork, batch: Batch, seed: int) -> float
         seen = np.broadcast_to(~missing, x.shape).astype(np.float32)
         known = np.where(missing, np.float32(0), x)
         step = network.follow(c, u, known, seen)
-        c = step.traces
+        c = step.carried
         squares.append((step.senses - x)[:, missing & sensed] ** 2)
     return float(np.concatenate([s.ravel() for s in squares]).mean())
 
