@@ -131,8 +131,7 @@ class LimitsLacking(AsmGymError):
     def __str__(self) -> str:
         return (
             f"{self.form} needs {self.needed}; this memory keeps limits of "
-            f"{', '.join(self.kinds) or 'nothing'}; its channels are {', '.join(self.channels)}. "
-            "A memory that was calibrated by an older version keeps less: calibrate it anew"
+            f"{', '.join(self.kinds) or 'nothing'}; its channels are {', '.join(self.channels)}"
         )
 
 

@@ -125,21 +125,14 @@ def test_a_monitor_that_cannot_blame_keeps_its_shares():
     assert followed.shares(np.zeros(D), True, shares) is shares
 
 
-def test_what_a_memory_saves_blames_the_same_and_an_older_file_blames_too():
+def test_what_a_memory_saves_blames_the_same():
     blame, healthy, width = learned()
-    saved = blame.completion.named()
-    again = Completion.found(saved, blame.completion.senses)
-    old = Completion.found(
-        {name: array for name, array in saved.items() if name != "completion_usual"},
-        blame.completion.senses,
-    )
+    again = Completion.found(blame.completion.named(), blame.completion.senses)
     assert again is not None
-    assert old is not None
     np.testing.assert_array_equal(again.usual, blame.completion.usual)
     rows = healthy[: ROW + 1].copy()
     rows[ROW, 5] += 10 * width[5]
-    for completion in (again, old):
-        assert Blame(completion)(rows, misled(5))[0] == 5
+    assert Blame(again)(rows, misled(5))[0] == 5
 
 
 def test_ranges_and_repeats_are_those_of_all_episodes():

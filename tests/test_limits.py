@@ -136,15 +136,14 @@ def test_a_memory_without_the_sense_of_a_format_is_refused_naming_what_it_has():
             FORMATS[form](limits)
 
 
-def test_ranges_are_saved_and_a_file_without_them_still_knows_forces(monitor, tmp_path):
+def test_ranges_are_saved_and_a_memory_without_them_is_to_be_calibrated(monitor, tmp_path):
     monitor.save(tmp_path / "a.asm")
     kept = load_monitor(tmp_path / "a.asm").limits()
     assert kept.as_dict() == monitor.limits().as_dict()
     shipped = NeuralASM.pretrained("panda")
     shipped.ranges_ = None
-    torques = shipped.limits().of(EXTERNAL_TORQUE)
-    assert len(torques) == 7
-    assert torques[0].near is None
+    with pytest.raises(NotFitted, match="calibrate"):
+        shipped.limits()
 
 
 @pytest.mark.parametrize("name", ["panda", "sawyer", "iiwa"])

@@ -36,10 +36,13 @@ MOST_ENTRIES = 2048
 # standardised numbers are clipped to this, so that one broken sense does not spoil all completions
 FARTHEST = 30.0
 
-USUAL = "completion_usual"  # in a checkpoint; files of earlier releases have none
-WIDEST = 8.0  # spreads from the mean that are in range where no range was learned
-NOISY_REPEATS = 2  # equal readings of a noisy sensor, where none were counted
-ARRAYS = ("completion_products", "completion_covariance", "completion_centre", "completion_error")
+ARRAYS = (
+    "completion_products",
+    "completion_covariance",
+    "completion_centre",
+    "completion_error",
+    "completion_usual",
+)
 
 
 class Filling(NamedTuple):
@@ -92,17 +95,14 @@ class Completion:
         """Restore what ``named`` returned; None where it is absent. Raises ValueError where it does not fit."""
         if not all(name in learned for name in ARRAYS):
             return None
-        products, covariance, centre, error = (np.asarray(learned[n], np.float64) for n in ARRAYS)
+        arrays = [np.asarray(learned[name], np.float64) for name in ARRAYS]
+        products, covariance, centre, error, usual = arrays
         spec = senses.spec
         Y = _entries(spec, len(products))
-        shapes = (len(products), 2), (Y, Y), (Y,), (spec.size,)
+        shapes = (len(products), 2), (Y, Y), (Y,), (spec.size,), (3, spec.size)
         check_shapes(learned, dict(zip(ARRAYS, shapes, strict=True)))
         if np.any((products < 0) | (products >= spec.size)):
             raise ValueError("completion_products should be columns of the stream")
-        usual = _assumed_readings(senses)
-        if USUAL in learned:
-            check_shapes(learned, {USUAL: usual.shape})
-            usual = np.asarray(learned[USUAL], np.float64)
         return cls(senses, products.astype(np.intp), covariance, centre, error, usual)
 
     def named(self) -> dict[str, NDArray[Any]]:
@@ -112,7 +112,7 @@ class Completion:
             "completion_covariance": self.covariance.astype(np.float32),
             "completion_centre": self.centre,
             "completion_error": self.error,
-            USUAL: self.usual,
+            "completion_usual": self.usual,
         }
 
     @property
@@ -206,13 +206,6 @@ def _longest_repeats(stream: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
     changed = np.where(stream[1:] != stream[:-1], rows, 0)
     newest_change = np.maximum.accumulate(changed, axis=0)
     return np.max(rows - newest_change, axis=0, initial=0) + 1
-
-
-def _assumed_readings(senses: StreamScaler) -> Floats:
-    """Return what ``usual_readings`` would, of a memory that has not counted."""
-    far = WIDEST * senses.spread
-    repeats = np.where(senses.spec.noise > 0, NOISY_REPEATS, np.inf)
-    return np.array([senses.mean - far, senses.mean + far, repeats])
 
 
 def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:

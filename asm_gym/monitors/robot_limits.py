@@ -15,9 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.detection.contact_limits import LIMITED
-from asm_gym.detection.hand_speed import AXES
-from asm_gym.detection.hand_speed_map import FASTEST_COLUMNS
 from asm_gym.detection.healthy_ranges import LEAD, Floats, share_beyond
 from asm_gym.exceptions import NotFitted
 from asm_gym.spec import MOTOR, Channel
@@ -60,7 +57,7 @@ class Limit:
         unit: of all four values.
         low, high: the limit, with its margin.
         least, most: of healthy motion.
-        near: share of healthy rows that come near the limit; None if the memory has not kept it.
+        near: share of healthy rows that come near the limit; None where nothing is counted.
     """
 
     kind: str
@@ -108,29 +105,23 @@ class RobotLimits:
 def limits_of(monitor: Any, margin: float = MARGIN) -> RobotLimits:
     """Return what healthy motion needs, by the episodes that a monitor was calibrated on.
 
-    A memory that was calibrated before ranges were kept knows its forces and the speed of its hands alone.
-
     Args:
         monitor: a ``CalibratedMonitor``.
         margin: of limits over the greatest healthy value, at least 1.
 
     Raises:
-        NotFitted: it is not calibrated.
+        NotFitted: it is not calibrated, or was by a version that kept no ranges.
         ValueError: the margin is below 1.
     """
     check_number("margin", margin, low=1.0)
-    if monitor.threshold_ is None:
+    if monitor.ranges_ is None:
         raise NotFitted("this monitor", "has no healthy ranges", "calibrate(nominal_episodes)")
     spec = monitor.spec
-    if monitor.ranges_ is None:
-        limits = [*_of_forces(monitor, margin), *_of_pace(monitor, margin)]
-    else:
-        limits = list(_of_ranges(monitor, margin))
     return RobotLimits(
         robot=spec.source,
         rate=1.0 / spec.dt,
         margin=margin,
-        limits=tuple(limits),
+        limits=tuple(_of_ranges(monitor, margin)),
         senses=tuple(channel.name for channel in spec.channels),
     )
 
@@ -205,32 +196,6 @@ def _of_targets(channel: Channel, ranges: Floats, columns: range, margin: float)
         lead = float(ranges[LEAD, column])
         if lead > 0:
             yield _symmetric(TARGET_DISTANCE, label, channel.unit, margin * lead, (-lead, lead))
-
-
-def _of_forces(monitor: Any, margin: float) -> Iterator[Limit]:
-    """Yield the limits of forces and torques by ``healthy_``, which leaves the hardest episodes out."""
-    kinds = dict(zip(LIMITED, (EXTERNAL_TORQUE, FORCE), strict=True))
-    values = iter(monitor.healthy_)
-    for channel in monitor.spec.channels:
-        if not channel.name.endswith(LIMITED):
-            continue
-        kind = next(kind for name, kind in kinds.items() if channel.name.endswith(name))
-        for label, most in zip(channel.labels, values, strict=False):
-            yield _symmetric(kind, label, channel.unit, margin * most, (-most, most))
-
-
-def _of_pace(monitor: Any, margin: float) -> Iterator[Limit]:
-    """Yield the limits of the hand's speed by ``pace_``, which leaves the fastest episodes out."""
-    if not monitor.pace_:
-        return
-    cells = np.concatenate(list(monitor.pace_.values()))[:, FASTEST_COLUMNS]
-    fastest = cells.max(axis=0).reshape(2, AXES).max(axis=0)  # along and against each axis
-    for axis, most in enumerate(fastest.tolist()):
-        kind, unit, name = HAND_SPEED, "m/s", "hand_velocity"
-        if axis >= 3:
-            kind, unit, name = TURNING_SPEED, "rad/s", "hand_angular_velocity"
-        label = f"{name}[{axis % 3}]"
-        yield _symmetric(kind, label, unit, margin * most, (-most, most))
 
 
 def _symmetric(
