@@ -35,9 +35,10 @@ FASTEST_EPISODES = 0.05
 ODD_EPISODES = 0.002
 """and of all episodes: of hundreds, an odd one sets no speed where few others go."""
 
-MOMENTUM = 2.0
-"""Limit of a hand or link near something, where no healthy hand was: 13 kg at the usual speed [N s].
-MuJoCo's contacts answer with at most 120/s times that."""
+MOMENTUM_OF_KNOWN_TASK = 2.0
+"""Limit of a hand or link where no healthy hand was, in a task with a map of its own: 13 kg at the usual speed [N s].
+MuJoCo's contacts answer with at most 105/s times that."""
+MOMENTUM = 4.0  # the same in other tasks, whose hands have to go where none was [N s]
 
 TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
 TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
@@ -105,7 +106,7 @@ class HandSpeedMap:
     ) -> Self | None:
         """Return the map of a task; that of all tasks where it has none, None where there are no cells."""
         if task and task in cells_by_task:
-            return cls(cells_by_task[task])
+            return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK)
         if not cells_by_task:
             return None
         return cls(np.concatenate(list(cells_by_task.values())))
