@@ -277,11 +277,9 @@ def test_a_policy_that_turns_back_leaves_a_contact_while_the_guard_holds(lift):
     simulation = lift.unwrapped.simulation
     site = simulation.arms.site[0]
     before = simulation.data.site_xpos[site][2]
-    *_, info = env.step(-down)
-    executed = info["asm"]["executed_action"]
-    assert info["asm"]["intervened"]
-    assert executed[2] > 0.0
-    for _ in range(5):
-        *_, info = env.step(-down)
+    back = [env.step(-down)[-1] for _ in range(10)]
+    assert any(
+        info["asm"]["intervened"] and info["asm"]["executed_action"][2] > 0.0 for info in back
+    )
     assert simulation.data.site_xpos[site][2] > before
-    assert info["contact_force"] < 40.0
+    assert back[-1]["contact_force"] < 40.0
