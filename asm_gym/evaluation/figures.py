@@ -115,7 +115,7 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
         panels[0].set(yscale="log", ylim=(floor / 1.5, ceiling * 5))
         panels[0].yaxis.set_major_locator(LogLocator(numticks=5))
         panels[0].yaxis.set_minor_formatter(NullFormatter())
-        _label_times(panels, traces)
+        _label_times([*panels], traces)
         fig.supylabel("surprise", fontsize=10)
         handles = _surprise_legend(traces)
         fig.legend(handles=handles, loc="outside upper center", ncols=len(handles))
@@ -195,7 +195,7 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
             finite = np.where(np.isfinite(sensed), sensed, np.nan)
             ax.plot(*_thinned(_times(trace), finite), color=BLUE)
             ax.set_title(trace.channels[channel])
-        _label_times(axes, [trace] * len(axes))
+        _label_times([*axes], [trace] * len(axes))
         handles = [
             Line2D([], [], color=BLUE, label="sensed"),
             Patch(color=VERMILLION, alpha=0.2, label="alarm"),
