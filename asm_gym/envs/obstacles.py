@@ -18,6 +18,8 @@ from asm_gym.envs.mujoco_views import DIRECTIONS, EVERYWHERE, Ahead, Arms, Float
 
 # At 0.5 m/s an arm goes half of it in a control step of 50 ms [m].
 NEAR = 0.05
+# From the hand to the middle of a geom of its gripper, or of what it carries [m].
+FROM_HAND = 0.15
 
 Ids = NDArray[np.int64]
 
@@ -30,6 +32,7 @@ class ArmGeoms(NamedTuple):
     others: Ids  # (O,) other geoms
     carriable: NDArray[np.int32]  # (ngeom,) the body that lies freely and has the geom; else -1
     radii: Floats  # (ngeom,) of the ball around each geom [m]
+    reaches: Floats  # (ngeom,) how far each geom of the arm reaches from the origin of its link [m]
     boxes: Floats  # (ngeom, 6) centre and half edges of the box around each, in its frame [m]
     places: Floats  # (ngeom, 3)
     frames: Floats  # (ngeom, 9)
@@ -48,6 +51,7 @@ class ArmGeoms(NamedTuple):
             others=np.flatnonzero(collides & (link_of_geom < 0)),
             carriable=np.array(free_bodies, np.int32)[model.geom_bodyid],
             radii=model.geom_rbound,
+            reaches=_reaches(model, arms[a]),
             boxes=model.geom_aabb,
             places=data.geom_xpos,
             frames=data.geom_xmat,
@@ -89,6 +93,13 @@ def _link_of(model: mujoco.MjModel, arm: Any, body: int) -> int:
             return links.index(body)
         body = int(model.body_parentid[body])
     return -1
+
+
+def _reaches(model: mujoco.MjModel, arm: Any) -> Floats:
+    """Return (ngeom,) how far the ball around each geom reaches from the origin of the link that carries it [m]."""
+    centres = np.linalg.norm(model.geom_pos, axis=1)
+    is_of_link = np.isin(model.geom_bodyid, arm.links)
+    return np.asarray(model.geom_rbound + np.where(is_of_link, centres, FROM_HAND))
 
 
 def _free_body(model: mujoco.MjModel, body: int) -> int:
@@ -156,13 +167,14 @@ def note_geom(
         apart = write_way(arm, geom, other, way)
         if apart - arm.radii[geom] > NEAR:
             continue
-        if apart == 0.0 or counts[link] == DIRECTIONS:
+        # Within the ball nobody knows which side of a long geom will touch.
+        if apart < arm.radii[geom] or counts[link] == DIRECTIONS:
             counts[link] = EVERYWHERE
             return
         direction = directions[link, counts[link]]
         for axis in range(3):
             direction[axis] = way[axis] / apart
-        direction[3] = arm.radii[geom]
+        direction[3] = arm.reaches[geom]
         counts[link] += 1
 
 
