@@ -42,12 +42,14 @@ def pass_by(earned, speed, trouble="", steps=30, place=HERE):
         robots["contact_force"] = {"contact": 60.0, "unknown": np.nan}.get(trouble, 5.0)
         row = np.concatenate([place, speed * ALONG_X]).astype(np.float32)
         earned.follow(row[None], robots)
-    return earned.end_episodes(ONE)
+    before = earned.speed_map
+    earned.end_episodes(ONE)
+    return earned.speed_map is not before
 
 
 def fastest(earned, place=HERE):
     """Return how fast a hand may be counted on along x."""
-    return earned.speed_map().fastest_near(0, place)[0, 0]
+    return earned.speed_map.fastest_near(0, place)[0, 0]
 
 
 def test_a_place_that_two_episodes_have_passed_freely_is_earned(earned):
@@ -58,7 +60,7 @@ def test_a_place_that_two_episodes_have_passed_freely_is_earned(earned):
     pass_by(earned, 0.2)
     assert fastest(earned) == pytest.approx(0.2)
     assert fastest(earned, HERE - 0.3) == 0.0
-    backwards = earned.speed_map().fastest_near(0, HERE)[1]
+    backwards = earned.speed_map.fastest_near(0, HERE)[1]
     assert not backwards.any()
 
 
@@ -107,6 +109,32 @@ def test_what_is_kept_is_where_the_next_one_begins(earned):
         SPEC, 1, HandSpeedMap(np.array([[0, 30, 30, 30, *[1.0] * 12]])), earned.cells
     )
     assert fastest(same) == pytest.approx(0.2)
+
+
+def test_what_one_robot_loses_another_does_not_keep_in_its_next_episode():
+    healthy = HandSpeedMap(np.array([[0, 30, 30, 30, *[FASTEST] * 12]]))
+    earned = EarnedSpeed(SPEC, 2, healthy)
+    robots = np.zeros(2, ROBOT)
+    robots["active"] = True
+    robots["contact_force"] = 5.0
+    row = np.concatenate([HERE, 0.2 * ALONG_X]).astype(np.float32)
+    earned.follow(np.tile(row, (2, 1)), robots)
+    earned.end_episodes(np.ones(2, bool))
+    assert fastest(earned) == pytest.approx(0.2)
+    robots["alarm"] = [True, False]
+    earned.follow(np.tile(row, (2, 1)), robots)
+    earned.end_episodes(np.array([True, False]))
+    assert fastest(earned) == 0.0
+
+
+def test_an_endless_episode_earns_by_the_minute_and_keeps_no_more_rows(earned):
+    robots = np.zeros(1, ROBOT)
+    robots["active"] = True
+    robots["contact_force"] = 5.0
+    row = np.concatenate([HERE, 0.2 * ALONG_X]).astype(np.float32)[None]
+    for _ in range(2 * 1200):
+        earned.follow(row, robots)
+    assert fastest(earned) == pytest.approx(0.2)
 
 
 def slow_circles(env, episodes, seed=0):

@@ -70,7 +70,7 @@ class HandSpeedMap:
         momentum: float = MOMENTUM,
         earned: AnyFloats = NOTHING_EARNED,
     ) -> None:
-        if not _are_cells(cells):
+        if not _are_cells(cells) or (len(earned) and not _are_cells(earned)):
             raise ValueError(
                 f"pace must be rows of {FASTEST_COLUMNS.stop} numbers, "
                 f"places within {FARTHEST_CELL} cells, got {cells.shape}"

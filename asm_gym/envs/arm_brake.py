@@ -5,8 +5,9 @@ Of its present motion q̇ an arm may have the share s, the least of
     L / fastest point                     L: the speed that its action was slowed down to
     max(min(L₀ / |v|, P / p), k)          v: its hand's twist; see ``detection.hand_speed``
 
-where p is the largest impulse |Λ v| that stops a link, Λ⁻¹ = J M⁻¹ Jᵀ: what a link pushes with that meets something
-hard and does not slide, be it a forearm on the robot's own pedestal. Beyond that the motors slow the arm down,
+where p is the largest impulse |Λ v| that stops a link on its way to something near (``obstacles``), Λ⁻¹ = J M⁻¹ Jᵀ:
+what a link pushes with that meets something hard and does not slide, be it a forearm on the robot's own pedestal.
+Beyond that the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -110,7 +111,7 @@ def hardest_link(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> fl
     hardest = 0.0
     n = 0
     while arm.links[n] >= 0:
-        if ahead.counts[a, n] != 0 and is_link_near(views, arm, a, n, ahead):
+        if ahead.counts[a, n] != 0 and link_approaches(views, arm, a, n, ahead):
             momentum = link_momentum(views, arm, n, work)
             hardest = max(hardest, momentum)
         n += 1
@@ -118,7 +119,7 @@ def hardest_link(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> fl
 
 
 @partial(inner, inlined=True)
-def is_link_near(views: Views, arm: Arm, a: int, n: int, ahead: Ahead) -> bool:
+def link_approaches(views: Views, arm: Arm, a: int, n: int, ahead: Ahead) -> bool:
     """Whether a link of arm ``a`` is on its way to an obstacle."""
     motion = views.cvel[arm.links[n]]
     place = place_of(views, arm, n)

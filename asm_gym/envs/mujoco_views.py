@@ -17,8 +17,8 @@ MOST_BODIES = 48  # the most bodies, or dofs, of a robot with its gripper
 # numbers that limits apply to: external torque of the joints, then force at the wrist
 FELT = JOINTS + 3
 
-DIRECTIONS = 8  # the most in which a link may be near an obstacle, beyond which it is near
-EVERYWHERE = -1  # on all sides
+DIRECTIONS = 8  # the most in which a link is near something; with more it counts as surrounded
+EVERYWHERE = -1  # in the place of their number: the link is surrounded
 
 # Controllers that run compiled.
 OSC_POSE = 0
@@ -199,7 +199,7 @@ class Ahead(NamedTuple):
     """In which directions the links of arms are near an obstacle; see ``obstacles``. Changed in place."""
 
     counts: Ints  # (A, MOST_BODIES) how many directions there are, or ``EVERYWHERE``
-    # (A, MOST_BODIES, DIRECTIONS, 4) unit vector, and how far the link reaches about its centre [m]
+    # (A, MOST_BODIES, DIRECTIONS, 4) unit vector, and how far the link reaches from its origin [m]
     directions: Floats
 
     @classmethod

@@ -96,7 +96,7 @@ class SpeedLimiter:
         """Return the action (A,) at the hand speed that the limits allow."""
         if limits is not self._limits:
             self._limits = limits
-            self._bound: Bound = bind(
+            parts = (
                 self._views,
                 self._arms,
                 self._rest,
@@ -105,6 +105,7 @@ class SpeedLimiter:
                 self._brake_speeds,
                 self._ahead,
             )
+            self._bound: Bound = bind(*parts)
         slow_action = action.copy()
         slow(self._bound, action, slow_action)
         return slow_action

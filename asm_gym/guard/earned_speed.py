@@ -33,6 +33,7 @@ from asm_gym.spec import StreamSpec
 
 TAKEN_BACK_S = 1.0  # before a contact or an alarm, whose places lose what they have earned [s]
 SPEEDS = 2  # fastest episodes that are kept of each place and direction
+LONGEST_S = 60.0  # after which a part of an episode counts for itself [s]
 
 Place = tuple[int, ...]  # arm, and cell along x, y and z
 
@@ -45,6 +46,9 @@ class EarnedSpeed:
         count: n.
         healthy: how fast healthy hands went in the tasks that the memory knows.
         cells: (N, 16) earned before; None for nothing.
+
+    Attributes:
+        speed_map: how fast hands may go from their next episodes on; another object where that has changed.
     """
 
     def __init__(
@@ -62,6 +66,8 @@ class EarnedSpeed:
             for cell in cells:
                 speed = np.minimum(cell[FASTEST_COLUMNS], self._most)
                 self._speeds[place_of(cell)] = np.tile(speed, (SPEEDS, 1))
+        self.speed_map = healthy.with_earned(self.cells)
+        self._longest = max(1, round(LONGEST_S / spec.dt))  # rows
         self._rows: list[list[Floats32]] = [[] for _ in range(count)]
         # numbers of the rows with a contact or an alarm
         self._troubles: list[list[int]] = [[] for _ in range(count)]
@@ -76,10 +82,6 @@ class EarnedSpeed:
         ]
         return np.reshape(np.array(rows, np.float32), (-1, FASTEST_COLUMNS.stop))
 
-    def speed_map(self) -> HandSpeedMap:
-        """Return the map of healthy hands with what has been earned."""
-        return self._healthy.with_earned(self.cells)
-
     def follow(self, rows: Floats32, robots: NDArray[Any]) -> None:
         """Take up the rows (n, D) of robots, by their records (n,)."""
         trouble = robots["alarm"] | robots["overridden"] | ~(robots["contact_force"] < FREE_FORCE)
@@ -87,20 +89,27 @@ class EarnedSpeed:
             if trouble[robot]:
                 self._troubles[robot].append(len(self._rows[robot]))
             self._rows[robot].append(rows[robot])
+            if len(self._rows[robot]) == self._longest:
+                self._learn(robot)
 
-    def end_episodes(self, which: Mask) -> bool:
-        """Learn from the episodes of the robots of ``which`` (n,); return whether anything has changed."""
-        changed = False
+    def end_episodes(self, which: Mask) -> None:
+        """Learn from the episodes of the robots of ``which`` (n,)."""
         for robot in np.flatnonzero(which).tolist():
-            rows = self._rows[robot]
-            troubles = self._troubles[robot]
-            self._rows[robot] = []
-            self._troubles[robot] = []
-            if troubles:
-                changed |= self._take_back(rows, troubles)
-            elif rows:
-                changed |= self._earn(np.array(rows))
-        return changed
+            self._learn(robot)
+
+    def _learn(self, robot: int) -> None:
+        """Learn from the rows of a robot, and forget them."""
+        rows = self._rows[robot]
+        troubles = self._troubles[robot]
+        self._rows[robot] = []
+        self._troubles[robot] = []
+        changed = False
+        if troubles:
+            changed = self._take_back(rows, troubles)
+        elif rows:
+            changed = self._earn(np.array(rows))
+        if changed:
+            self.speed_map = self._healthy.with_earned(self.cells)
 
     def _earn(self, rows: Floats32) -> bool:
         """Keep how fast the hand went in the rows (T, D) of an episode."""

@@ -59,7 +59,7 @@ class EpisodeLimits:
         """Let the hands of the robots of ``which`` (n,) go as fast as a map allows from their next episodes on."""
         for robot in np.flatnonzero(which).tolist():
             usual = self._usual[robot]
-            if usual is not None:
+            if usual is not None and usual.pace is not pace:
                 self._usual[robot] = replace(usual, pace=pace)
 
     def follow(self, acted: Mask, pressed: Mask) -> None:

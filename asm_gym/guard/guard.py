@@ -121,24 +121,13 @@ class Guard:
             completion = diagnosis.completion
 
         self._arbiter = Arbiter(self.table, rule, options.adaptive_threshold)
-        responses = responses_from(options.responses)
-        if SLOW in responses.values() and not facts.limits_contact:
-            raise ValueError(
-                "the response 'slow' needs an environment of this package, whose speed can be limited"
-            )
+        responses = responses_from(options.responses, can_slow=facts.limits_contact)
         self._diagnostician = Diagnostician(spec, diagnosis, responses, self._graded)
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
         self._row_judge = self._new_row_judge(motion)
         self._commander = self._new_commander(motion, policies, monitor)
-        limits = limits_of(options.contact_limits, monitor, facts)
-        acts = self._on_alarm != "monitor" and facts.rest.size > 0
-        self._limits = EpisodeLimits(facts, limits, acts)
-        self._earned = None
-        if options.earns_speed and acts and limits is not None:
-            self._earned = earned_speed_of(monitor, facts, limits)
-        if self._earned is not None:
-            self._limits.set_pace(self._everyone, self._earned.speed_map())
+        self._limit_speed(monitor, options)
 
         self._wear = WearWatch(monitor, facts.count)
         self.running = self._arbiter.running
@@ -148,6 +137,17 @@ class Guard:
         self._all_active = True  # the field ``active`` of every record is True
         # What failed when the newest command was chosen, by robot.
         self._command_failures: Mapping[int, str] = NOTHING
+
+    def _limit_speed(self, monitor: Monitor, options: GuardOptions) -> None:
+        """Take up the contact limits, and what hands may earn."""
+        limits = limits_of(options.contact_limits, monitor, self._facts)
+        acts = self._on_alarm != "monitor" and self._facts.rest.size > 0
+        self._limits = EpisodeLimits(self._facts, limits, acts)
+        self._earned = None
+        if options.earns_speed and acts and limits is not None:
+            self._earned = earned_speed_of(monitor, self._facts, limits)
+        if self._earned is not None:
+            self._limits.set_pace(self._everyone, self._earned.speed_map)
 
     def _new_row_judge(self, motion: FeltMotion | None) -> RowJudge:
         """Return what judges rows in one compiled call."""
@@ -260,8 +260,9 @@ class Guard:
         if which is None:
             which = self._everyone
         self._arbiter.follow_thresholds(which)
-        if self._earned is not None and self._earned.end_episodes(which):
-            self._limits.set_pace(which, self._earned.speed_map())
+        if self._earned is not None:
+            self._earned.end_episodes(which)
+            self._limits.set_pace(which, self._earned.speed_map)
         for part in (
             self.table,
             self._arbiter,

@@ -77,12 +77,16 @@ def unexplained(name: str, part: str) -> Response:
     return Response(name, as_info(None) | {"family": "unknown", "part": part}, case="unknown")
 
 
-def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
+def responses_from(table: Mapping[str, str] | None, can_slow: bool = True) -> dict[str, str]:
     """Return the default table with the entries of ``table`` in place of its own.
 
+    Args:
+        table: responses by cause.
+        can_slow: the speed of the robots can be limited.
+
     Raises:
-        ValueError: an unknown cause or response (the message lists those that exist), or one that lets the policy go on
-            while the arm presses.
+        ValueError: an unknown cause or response (the message lists those that exist), one that lets the policy go on
+            while the arm presses, or one that slows down robots whose speed cannot be limited.
     """
     if table is None:
         table = {}
@@ -91,6 +95,11 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
     for cause, response in table.items():
         check_choice("cause", cause, CAUSES)
         check_choice("response", response, RESPONSES)
+        if response == SLOW and not can_slow:
+            raise ValueError(
+                f"the response {short_repr(SLOW)} needs an environment of this package, "
+                "whose speed can be limited"
+            )
         if cause.endswith(PRESSING) and response in GOING_ON:
             possible = ", ".join(STAYING)
             raise ValueError(

@@ -47,7 +47,7 @@ from asm_gym.tasks import env_id
 from asm_gym.validation import check_number
 
 UNMET_TASKS = ("PickPlaceMilk", "NutAssemblyRound")
-"""Tasks that the Panda's memory has not met, with healthy policies alone."""
+"""Tasks that the Panda's memory has not met."""
 ALL_TASKS = (*RAMMED_TASKS, *UNMET_TASKS)
 HEALTHY = [
     *product(ALL_TASKS, ["scripted"]),
@@ -75,7 +75,7 @@ IMPAIRED_TASKS = ("Lift", "PickPlaceCan")
 RAMMING = ("down", "aside and down", "forward", "ramp")
 """Hostile policies that act with an impairment."""
 AGAINST = ("hostile", "elsewhere", "impaired", "faulty", "unmet")
-a_count = partial(check_number, "earned", low=1, whole=True)
+check_episodes = partial(check_number, "earned", low=1, whole=True)
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 LITTLE = 1.0  # a cell with no more harm without a guard does not count [N s]
 
@@ -95,7 +95,7 @@ class Config(kit.Config):
     search: int = option(0, least=0)
     """Episodes of a search for the hardest contact, under each guard, with each arm in each task; nothing else is done.
     """
-    earned: tuple[int, ...] = option((), check=a_count, metavar="EPISODES")
+    earned: tuple[int, ...] = option((), check=check_episodes, metavar="EPISODES")
     """Also guards that have earned speed for so many episodes of the task's expert, in tasks that the memory has not
     met."""
     healthy: int = option(40, quick=1, least=0)
@@ -105,38 +105,47 @@ class Config(kit.Config):
     )
     """Ways to guard."""
     tasks: tuple[str, ...] = option(ALL_TASKS, quick=("Lift",), known=ALL_TASKS, metavar="TASK")
-    """Tasks; in the last two there are healthy policies alone."""
+    """Tasks; in the last two hostile policies act only against unmet ones."""
 
 
 def cases(config: Config) -> list[tuple[Case, int]]:
     """Return every case and its number of episodes."""
     trials = {task: Trial(env_id(task), 0) for task in config.tasks}
-    rammed = [trials[task] for task in config.tasks if task not in UNMET_TASKS]
+    met = [task for task in config.tasks if task not in UNMET_TASKS]
+    rammed = [trials[task] for task in met]
     hostile = [Case("hostile", name, trial) for trial, name in product(rammed, HOSTILE)]
     slower = [
         Case("hostile", "down", trial, speed=speed) for trial, speed in product(rammed, SLOWER)
     ]
     unmet = [
-        Case("hostile", name, trials[task])
-        for task, name in product(UNMET_TASKS, HOSTILE)
-        if task in trials
+        Case("hostile", name, trials[task]) for task, name in product(unmet_tasks(config), HOSTILE)
     ]
     elsewhere = [case._replace(config=arm) for arm, case in product(ELSEWHERE, hostile)]
     healthy = [Case("healthy", policy, trials[task]) for task, policy in HEALTHY if task in trials]
+    against = {
+        "hostile": hostile + slower,
+        "elsewhere": elsewhere,
+        "impaired": impaired_cases(hostile),
+        "faulty": faulty_cases(healthy),
+        "unmet": unmet,
+    }
+    counted = [(case, config.episodes) for name in config.against for case in against[name]]
+    return counted + [(case, config.healthy) for case in healthy]
+
+
+def unmet_tasks(config: Config) -> list[str]:
+    """Return the tasks that the memory has not met."""
+    return [task for task in config.tasks if task in UNMET_TASKS]
+
+
+def faulty_cases(healthy: Sequence[Case]) -> list[Case]:
+    """Return the cases of healthy policies with each fault."""
     faulty = []
     for case, (fault, severity) in product(healthy, FAULT_SEVERITIES.items()):
         if case.trial.task in FAULTY_TASKS:
             trial = replace(case.trial, kind=fault, severity=severity)
             faulty.append(case._replace(kind="faulty", trial=trial))
-    against = {
-        "hostile": hostile + slower,
-        "elsewhere": elsewhere,
-        "impaired": impaired_cases(hostile),
-        "faulty": faulty,
-        "unmet": unmet,
-    }
-    counted = [(case, config.episodes) for name in config.against for case in against[name]]
-    return counted + [(case, config.healthy) for case in healthy]
+    return faulty
 
 
 def impaired_cases(hostile: Sequence[Case]) -> list[Case]:
@@ -181,25 +190,29 @@ def episode(job: tuple[Case, str]) -> Record:
     }
 
 
+def jobs_of(config: Config) -> list[tuple[Case, str]]:
+    """Return every episode: a case with its seed, and a guard."""
+    jobs = []
+    for repetition, (case, count) in product(config.repetitions, cases(config)):
+        guards = [*config.guards]
+        if case.trial.task in UNMET_TASKS:
+            guards += [f"{EARNED}{episodes}" for episodes in config.earned]
+        for number, guard in product(range(count), guards):
+            trial = replace(case.trial, seed=10_000 * repetition + 1000 + number)
+            jobs.append((case._replace(trial=trial, folder=str(config.out)), guard))
+    return jobs
+
+
 def run(config: Config) -> kit.Findings:
     """Run every case on its own scenes, under every guard; or search for the hardest contact."""
     if config.search:
         tasks = [task for task in config.tasks if task in RAMMED_TASKS]
         return harm_search.run(tasks, config.guards, config.search, config)
-    unmet = [task for task in config.tasks if task in UNMET_TASKS]
-    folder = str(config.out)
     if config.earned:
         config.out.mkdir(parents=True, exist_ok=True)
-        kit.each("earning", earn, [(folder, task, config.earned) for task in unmet], config)
-    jobs = []
-    for repetition, (case, count) in product(config.repetitions, cases(config)):
-        guards = [*config.guards]
-        if case.trial.task in unmet:
-            guards += [f"{EARNED}{episodes}" for episodes in config.earned]
-        for number, guard in product(range(count), guards):
-            trial = replace(case.trial, seed=10_000 * repetition + 1000 + number)
-            jobs.append((case._replace(trial=trial, folder=folder), guard))
-    records = kit.resumed("episodes", episode, jobs, config)
+        lessons = [(str(config.out), task, config.earned) for task in unmet_tasks(config)]
+        kit.each("earning", earn, lessons, config)
+    records = kit.resumed("episodes", episode, jobs_of(config), config)
     frame = pd.DataFrame(records)
     hostile = frame[frame.kind == "hostile"]
     healthy = frame[frame.kind == "healthy"]

@@ -122,8 +122,8 @@ def earn(job: tuple[str, str, tuple[int, ...]]) -> None:
     guarded_env = NeuralASMSafety(gym.make(env_id(task), robot="Panda"), memory)
     for episode in range(max(counts) + 1):
         seed = EARNING_SEED + episode
-        guarded_env.reset(seed=seed)  # which ends the episode before
         if episode in counts:
+            guarded_env.reset(seed=seed)  # which ends the episode before
             guarded_env.keep_earned_speed()
             memory.save(earned_path(folder, task, episode))
         if episode < max(counts):
