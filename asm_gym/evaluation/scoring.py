@@ -23,7 +23,7 @@ from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
-from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
+from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.version import __version__
@@ -107,23 +107,16 @@ def benchmark(
     """
     paths = tuple(file.resolve() for file in files)
     folder = folder.resolve()
-    names_by_model: dict[str, list[str]] = {}  # a model that is judged in two ways is fitted once
-    for name in monitors:
-        names_by_model.setdefault(name.removesuffix(EVIDENCE), []).append(name)
 
-    def score_model(names: Sequence[str]) -> list[DetectionMetrics]:
+    def score_monitor(name: str) -> DetectionMetrics:
         roles = read_recordings(paths).roles
-        results = []
-        for name in names:
-            monitor = fitted(folder, name, roles["fit"], seed)
-            results.append(calibrated_metrics(name, monitor, roles, rate, window_s))
-        return results
+        monitor = fitted(folder, name, roles["fit"], seed)
+        return calibrated_metrics(name, monitor, roles, rate, window_s)
 
-    results_by_model = map_items(score_model, list(names_by_model.values()))
-    metrics = {result.name: result for results in results_by_model for result in results}
+    results = map_items(score_monitor, list(dict.fromkeys(monitors)))
     recordings = read_recordings(paths)
     return BenchmarkResult(
-        monitors={name: metrics[name] for name in monitors},
+        monitors={result.name: result for result in results},
         detectability=detectability_of(
             recordings.twins, recordings.roles.get("faulty", []), window_s
         ),
@@ -178,18 +171,17 @@ def code_digest() -> str:
 def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
     """Return the monitor fitted on these episodes, from ``folder`` if it was fitted before.
 
-    A file is named for the model, and digests of its settings, its episodes and our code.
+    A file is named for the monitor, and digests of its settings, its episodes and our code.
     """
-    model = name.removesuffix(EVIDENCE)
     monitor = make_monitor(name, recordings[0].spec, seed=seed)
-    settings = json.dumps((model, __version__, monitor.get_params()), default=str)
+    settings = json.dumps((name, __version__, monitor.get_params()), default=str)
     digest = hashlib.sha256(settings.encode())
     for recording in recordings:
         digest.update(str(recording.stream.shape).encode())
         digest.update(recording.stream.tobytes())
-    path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}-{code_digest()}.asm"
+    path = folder / "monitors" / f"{name}-{digest.hexdigest()[:12]}-{code_digest()}.asm"
     with suppress(FileNotFoundError, ValueError):  # fitted anew if missing or damaged
-        return monitor_class(name).load(path)
+        return load_monitor(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.fit(recordings).save(path)
     return monitor

@@ -10,7 +10,6 @@ from asm_gym.monitors.monitor_protocol import ForgetsEvidence as ForgetsEvidence
 from asm_gym.monitors.monitor_protocol import Monitor as Monitor
 from asm_gym.monitors.monitor_protocol import Surprise as Surprise
 from asm_gym.monitors.monitor_registry import DETECTIONS as DETECTIONS
-from asm_gym.monitors.monitor_registry import EVIDENCE as EVIDENCE
 from asm_gym.monitors.monitor_registry import MONITORS as MONITORS
 from asm_gym.monitors.monitor_registry import load_monitor as load_monitor
 from asm_gym.monitors.monitor_registry import make_monitor as make_monitor

@@ -50,7 +50,7 @@ from asm_gym.monitors.training_data import (
     hashes_of,
     with_held_out,
 )
-from asm_gym.validation import check_choice, check_flag, check_number, typed
+from asm_gym.validation import check_flag, check_number, typed
 
 
 class CalibratedMonitor:
@@ -58,7 +58,7 @@ class CalibratedMonitor:
 
     Args:
         model: predicts the stream.
-        detections: compute surprise from its errors. The first is in use; the others are fitted and saved beside it.
+        detection: computes surprise from its errors.
         seed: of all random draws while learning.
 
     Attributes:
@@ -92,14 +92,11 @@ class CalibratedMonitor:
     ranges_: NDArray[np.floating[Any]] | None
     wear_: NDArray[np.floating[Any]] | None
 
-    def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
-        if not detections:
-            raise ValueError("a monitor needs a detection, got none")
+    def __init__(self, model: StreamModel, detection: Detection, seed: int = 0) -> None:
         self.seed = check_number("seed", seed, low=0, whole=True)
         self.spec = model.spec
         self.model = model
-        self.detection = detections[0]
-        self.detections = {detection.name: detection for detection in detections}
+        self.detection = detection
         self._uncalibrate()
         self.learned_from_: Hashes | None = None
         self.ceilings_from_: Hashes | None = None
@@ -119,10 +116,7 @@ class CalibratedMonitor:
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
         """All arrays that ``fit`` has learned, by name; empty before."""
-        learned = dict(self.model.learned_)
-        for detection in self.detections.values():
-            learned |= detection.learned_
-        return learned
+        return {**self.model.learned_, **self.detection.learned_}
 
     @property
     def skills_(self) -> tuple[str, ...]:
@@ -130,10 +124,9 @@ class CalibratedMonitor:
         return self.model.skills_
 
     def get_params(self) -> dict[str, Any]:
-        """Return the hyperparameters by name, in one order whichever detection is in use."""
+        """Return the hyperparameters by name."""
         params: dict[str, Any] = {}
-        detections = [self.detections[name] for name in sorted(self.detections)]
-        for part in (self.model, *detections):
+        for part in (self.model, self.detection):
             names = parameter_names(type(part))
             params |= {name: getattr(part, name) for name in names if name != "seed"}
         return params | {"seed": self.seed}
@@ -143,18 +136,6 @@ class CalibratedMonitor:
         """Return a copy with another threshold, ``inf`` for no alarm."""
         other = self._copy()
         other.threshold_ = check_number("threshold", value, infinite=True)
-        return other
-
-    @typed
-    def with_detection(self, detection: str | Detection) -> Self:
-        """Return a copy without a threshold, under a new detection, or one that was fitted beside it, by name."""
-        other = self._copy()
-        if isinstance(detection, str):
-            check_choice(f"detection of this {self._name}", detection, self.detections)
-            detection = other.detections[detection]
-        other.detection = detection
-        other.detections[detection.name] = detection
-        other._uncalibrate()
         return other
 
     @typed
@@ -210,18 +191,17 @@ class CalibratedMonitor:
             self._learn_anew(episodes, progress)
 
     def _learn_anew(self, episodes: Sequence[Episode], progress: Progress) -> None:
-        """Fit the model, and then each detection on the model's errors."""
+        """Fit the model, and then the detection on the model's errors."""
         rng = np.random.default_rng(self.seed)
         learned, held_out = with_held_out(episodes, self.model.held_out, rng)
         self.model.fit(learned, rng, progress)
         self._place_errors()
         nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
-        for detection in self.detections.values():
-            shared_names = self.model.learned_.keys() & set(detection.arrays)
-            if shared_names:
-                names = ", ".join(sorted(shared_names))
-                raise ValueError(f"{self.model.kind} and {detection.name} both learn {names}")
-            detection.fit(nominal, rng)
+        shared_names = self.model.learned_.keys() & set(self.detection.arrays)
+        if shared_names:
+            names = ", ".join(sorted(shared_names))
+            raise ValueError(f"{self.model.kind} and {self.detection.name} both learn {names}")
+        self.detection.fit(nominal, rng)
         self.model.crossfitted = {}
 
     def _nominal_outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
@@ -298,7 +278,6 @@ class CalibratedMonitor:
     def _set_ceilings(self, episodes: Sequence[Episode]) -> None:
         """Set the ceilings of the detection by healthy episodes."""
         self.detection = with_ceilings(self, episodes)
-        self.detections[self.detection.name] = self.detection
         self.ceilings_from_ = hashes_of(episodes)
 
     def _set_threshold(
@@ -430,8 +409,6 @@ class CalibratedMonitor:
     def restore(self, saved: Checkpoint) -> Self:
         """Take over what ``save`` wrote of a monitor of the same spec, model and hyperparameters.
 
-        It has a threshold only where it was calibrated under the detection in use.
-
         Raises:
             ValueError: something is missing, or does not fit together.
         """
@@ -439,9 +416,7 @@ class CalibratedMonitor:
         kept = read_monitor(saved)
         self.restore_learned(kept.learned, tuple(header["skills"]))
         vars(self).update(kept.attributes)
-        if header["detection"] == self.detection.name:
-            self.threshold_ = threshold_below(header["threshold"], self.detection.reach)
-            vars(self).update(kept.calibration)
+        self.threshold_ = threshold_below(header["threshold"], self.detection.reach)
         return self
 
     def restore_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
@@ -449,10 +424,8 @@ class CalibratedMonitor:
         require_arrays(arrays, self.detection.arrays)
         self._uncalibrate()
         arrays_of_model = dict(arrays)
-        for detection in self.detections.values():
-            if arrays.keys() >= set(detection.arrays):
-                own_arrays = {name: arrays_of_model.pop(name) for name in detection.arrays}
-                detection.restore(own_arrays)
+        own_arrays = {name: arrays_of_model.pop(name) for name in self.detection.arrays}
+        self.detection.restore(own_arrays)
         self.model.restore(arrays_of_model, skills)
         self._place_errors()
         return self
@@ -485,8 +458,7 @@ class CalibratedMonitor:
         other = copy.copy(self)
         other.about = copy.deepcopy(self.about)
         other.model = copy.copy(self.model)
-        other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
-        other.detection = other.detections[self.detection.name]
+        other.detection = copy.copy(self.detection)
         return other
 
     def _require_fitted(self) -> None:

@@ -38,8 +38,7 @@ class SavedMonitor(NamedTuple):
     """What a checkpoint holds of a monitor."""
 
     learned: Arrays  # by name
-    attributes: dict[str, Any]  # that hold under any detection, by name
-    calibration: dict[str, Any]  # attributes that hold under the detection it was calibrated with
+    attributes: dict[str, Any]  # by name
 
 
 def read_monitor(saved: Checkpoint) -> SavedMonitor:
@@ -60,20 +59,22 @@ def read_monitor(saved: Checkpoint) -> SavedMonitor:
     arrays = {name: saved.array(name, *shape) for name, shape in shapes.items()}
 
     check_choice("promise", header["promised"], (EPISODE, HOUR))
-    calibration: dict[str, Any] = {"promised_": header["promised"]}
-    calibration["maxima_"] = arrays.pop(MAXIMA, None)
-    calibration["blocks_"] = None
-    if BLOCKS in arrays:
-        calibration["blocks_"] = Blocks.restored(arrays.pop(BLOCKS))
-
     healthy = [check_number("healthy", value, low=0.0) for value in header["healthy"]]
-    attributes: dict[str, Any] = {"about": dict(header["about"]), "healthy_": tuple(healthy)}
+    attributes: dict[str, Any] = {
+        "promised_": header["promised"],
+        "maxima_": arrays.pop(MAXIMA, None),
+        "blocks_": None,
+        "about": dict(header["about"]),
+        "healthy_": tuple(healthy),
+    }
+    if BLOCKS in arrays:
+        attributes["blocks_"] = Blocks.restored(arrays.pop(BLOCKS))
     for attribute, prefix in BY_TASK.items():
         tasks = [name for name in arrays if name.startswith(prefix)]
         attributes[attribute] = {name.removeprefix(prefix): arrays.pop(name) for name in tasks}
     for attribute, name in OPTIONAL.items():
         attributes[attribute] = arrays.pop(name, None)
-    return SavedMonitor(arrays, attributes, calibration)
+    return SavedMonitor(arrays, attributes)
 
 
 def threshold_below(threshold: object, reach: float) -> float | None:

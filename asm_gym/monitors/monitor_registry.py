@@ -35,60 +35,41 @@ class MonitorKind:
 
     # Class of its model, or of the whole monitor; or ``module:class``, imported when it is needed.
     model: Any
-    # Detection that its authors judged it by; always fitted, so that one fit serves both.
-    own: str = "evidence"
-    detection: str = "evidence"  # the one in use
+    detection: str = "evidence"
 
     @property
     def model_class(self) -> Any:
         return target(self.model)
 
     @property
-    def detection_classes(self) -> list[Any]:
-        """Of its detections, the one in use first."""
-        check_choice("detection", self.detection, DETECTIONS)
-        names = dict.fromkeys((self.detection, self.own, "evidence"))
-        return [target(DETECTIONS[name]) for name in names]
+    def parts(self) -> tuple[Any, ...]:
+        """Classes of its model and its detection, or of the whole monitor alone."""
+        if not issubclass(self.model_class, CalibratedMonitor):
+            return self.model_class, target(DETECTIONS[self.detection])
+        check_choice(f"detection of {self.model_class.kind}", self.detection, ["evidence"])
+        return (self.model_class,)
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
         """Names that ``make_monitor`` takes beside the spec."""
-        parts = [self.model_class]
-        if not self._whole:
-            parts += self.detection_classes
-        names = [name for part in parts for name in parameter_names(part)]
+        names = [name for part in self.parts for name in parameter_names(part)]
         return tuple(dict.fromkeys([*names, "seed"]))
 
     def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
         """Return the monitor, not yet fitted."""
-
-        def part(kind: Any) -> Any:
+        parts = []
+        for kind in self.parts:
             names = [name for name in parameter_names(kind) if name in hyperparameters]
-            return made(kind, spec, {name: hyperparameters[name] for name in names})
-
-        own = part(self.model_class)
-        if not self._whole:
-            detections = map(part, self.detection_classes)
-            return CalibratedMonitor(own, *detections, seed=hyperparameters.get("seed", 0))
-        if self.detection == own.detection.name:
-            return own
-        if self.detection in own.detections:
-            return own.with_detection(self.detection)
-        return own.with_detection(part(self.detection_classes[0]))
-
-    def load(self, path: str | Path) -> CalibratedMonitor:
-        """Read what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
-        return restored(path, read_checkpoint(path, self.model_class.kind), self)
-
-    @property
-    def _whole(self) -> bool:
-        """Whether its class is that of a monitor, and not of a mere model."""
-        return issubclass(self.model_class, CalibratedMonitor)
+            parts.append(made(kind, spec, {name: hyperparameters[name] for name in names}))
+        if len(parts) == 1:
+            return parts[0]
+        model, detection = parts
+        return CalibratedMonitor(model, detection, seed=hyperparameters.get("seed", 0))
 
 
 def _rival(model: str, detection: str) -> MonitorKind:
     """Return a rival, by its model in this folder and the detection that its authors judged it by."""
-    return MonitorKind(f"asm_gym.monitors.{model}", own=detection, detection=detection)
+    return MonitorKind(f"asm_gym.monitors.{model}", detection)
 
 
 RIVALS = {
@@ -143,7 +124,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
             f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, "
             f"got the name {name!r}"
         )
-    row = MonitorKind(model, detection, detection)
+    row = MonitorKind(model, detection)
     MONITORS.register(name, row)
     MONITORS[name + EVIDENCE] = replace(row, detection="evidence")
 
@@ -182,7 +163,7 @@ def monitor_class(name: str) -> MonitorKind:
     model, _, detection = name.partition("+")
     kind = MONITORS[name] if name in MONITORS else replace(MONITORS[model], detection=detection)
     with needed_for(f"monitor {name}"):
-        _ = kind.model_class, kind.detection_classes
+        _ = kind.parts
     return kind
 
 

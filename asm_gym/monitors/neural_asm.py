@@ -257,15 +257,8 @@ class NeuralASM(CalibratedMonitor):
         """Observe as in ``CalibratedMonitor``; write the new state to ``out``, a state that is no longer needed."""
         self._require_fitted()
         rows = checked_rows(state, stream, self.spec)
-        kernel = self._row_kernel()
-        if kernel is None:
-            new, surprise = super().observe(state, rows)
-            new = new._replace(excuses=state.excuses)
-            divisor = np.ones(len(rows))
-        else:
-            # divisor (B,): by it knocks and stops have divided the surprise
-            new, surprise, divisor = kernel(state, rows, out)
-
+        # divisor (B,): by it knocks and stops have divided the surprise
+        new, surprise, divisor = self._row_kernel()(state, rows, out)
         if self.values_ is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
             new = new._replace(values=values)
@@ -297,11 +290,11 @@ class NeuralASM(CalibratedMonitor):
         self.values_ = ValueJudge.restored(self.spec, arrays, self.seed, self.urdf)
         return self
 
-    def _row_kernel(self) -> RowKernel | None:
-        """Return the kernel of the weights as they are; None under another detection than that of evidence."""
+    def _row_kernel(self) -> RowKernel:
+        """Return the kernel of the weights as they are."""
         memory = self.model.compiled_
-        if not isinstance(self.detection, EvidenceDetection) or memory is None:
-            return None
+        assert memory is not None
+        assert isinstance(self.detection, EvidenceDetection)
         if self._kernel is None or not self._kernel.is_of(memory, self.detection):
             self._kernel = RowKernel(memory, self.detection, self.excuses_)
         return self._kernel

@@ -23,8 +23,8 @@ from asm_gym.evaluation.report_page import publish
 from asm_gym.evaluation.scoring import benchmark
 from asm_gym.faults import foreign_faults
 from asm_gym.faults.suite import SEVERITIES, kinds_of
-from asm_gym.monitors import MONITORS, make_monitor
-from asm_gym.monitors.monitor_registry import check_monitor_name
+from asm_gym.monitors import make_monitor
+from asm_gym.monitors.monitor_registry import BY_EVIDENCE, check_monitor_name
 from asm_gym.rollouts.detection_corpus import SKILLS, VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
@@ -66,9 +66,10 @@ class Args(Options):
     )
     """Length of an episode of an environment given by its id; by default its own."""
     monitors: tuple[str, ...] = option(
-        tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name
+        ("neural_asm", *BY_EVIDENCE), quick=_QUICK, least=1, check=check_monitor_name
     )
-    """Names of monitors; MODEL+DETECTION combines any two, as in external_torque_limit+evidence."""
+    """Names of monitors. Without +evidence a rival is judged as its authors do; MODEL+DETECTION combines any two, as in
+    external_torque_limit+evidence."""
     faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all; development or test for one half of the suite."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
