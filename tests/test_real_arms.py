@@ -17,8 +17,8 @@ from asm_gym.scripts.reproduce.added_faults import (
     jacobian,
     with_fault,
 )
-from asm_gym.scripts.reproduce.arm_recordings import ARMS, SERVO_CHANNELS, SLIP_RAD
-from asm_gym.scripts.reproduce.real_arms import Job, examined, fault_result, split
+from asm_gym.scripts.reproduce.arm_recordings import ARMS, SLIP_RAD
+from asm_gym.scripts.reproduce.real_arms import Job, examined, fault_result, monitor_row, split
 from tests.streams import pendulum_columns
 
 INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
@@ -134,16 +134,19 @@ def test_a_run_of_servos_is_cut_at_a_glitch_and_marked_rows_are_of_a_heated_serv
         folder = tmp_path / "matlab_ros_2024" / run
         folder.mkdir(parents=True)
         for motor in range(1, 7):
-            data = pd.DataFrame({name: rng.integers(100, 900, 400) for name in SERVO_CHANNELS})
+            ranges = {"position": (100, 900), "temperature": (20, 60), "voltage": (7000, 7500)}
+            data = pd.DataFrame({name: rng.integers(*r, 400) for name, r in ranges.items()})
             data["label"] = 0
             if motor == 3 and faulty:
                 data.loc[100:149, "label"] = 1
-            if motor == 5 and not faulty:
+            if motor == 5:  # each reading is a glitch
                 data.loc[200, "position"] = 4096 + 500
+                data.loc[201, "temperature"] = 255
+                data.loc[202, "voltage"] = -25514
             data.to_csv(folder / f"data_motor_{motor}.csv", index=False)
     runs = arm_recordings.armpi_runs(tmp_path)
-    assert [len(run["position[0]"]) for run in runs.healthy] == [150, 149]
-    assert [int(run["label"].sum()) for run in runs.faulty["glitch"]] == [1]
+    assert [len(run["position[0]"]) for run in runs.healthy] == [150, 147]
+    assert [int(run["label"].sum()) for run in runs.faulty["glitch"]] == [3, 3]
     assert [int(run["label"].sum()) for run in runs.faulty["heated"]] == [50]
     assert max(run["position[4]"].max() for run in runs.healthy) < 1000
 
@@ -171,7 +174,7 @@ def test_pieces_are_dealt_out_once_and_no_more_is_learned_than_asked_for(folder)
         assert len({piece.stream.tobytes() for piece in parts}) == len(parts) == 15
         tested += use.tested
     assert len({piece.stream.tobytes() for piece in tested}) == 15
-    few = split(Job("ur10", "kalman", 0, 0), runs, minutes=3.01 / 60)
+    few = split(Job("ur10", "kalman", 0, 0, minutes=3.01 / 60), runs)
     assert len(few.learned) == 3
     assert len(few.tested) == 4
 
@@ -191,3 +194,12 @@ def test_a_fault_is_found_only_after_its_onset_and_without_an_alarm_before():
     assert found["found"]
     assert found["delay"] == pytest.approx(0.02)
     assert not fault_result(Unit(), "step", clip, Score([0, 2, 0.5, 0.9, 2]))["found"]
+
+
+def test_labelled_stretches_are_told_from_those_found_by_chance():
+    healthy = {"kind": "", "alarms": 6, "alarm_s": 0.0, "seconds": 3600.0, "excess": 0.5}
+    labelled = {"kind": "heated", "added": False, "found": True, "seconds": 600.0, "excess": 2.0}
+    common = {"promised": 6.0, "learned_min": 1.0, "delay": np.nan}
+    records = pd.DataFrame([common | healthy, common | labelled, common | labelled])
+    expected = 2 * (1 - np.exp(-1.0))  # six false alarms an hour, ten minutes each
+    assert monitor_row("any", records, 0)["heated"] == f"2 of 2 ({expected:.1f} by chance)"

@@ -22,7 +22,13 @@ from asm_gym.readings import spans
 Columns = dict[str, NDArray[Any]]
 
 SLIP_RAD = 0.05  # of an encoder [rad]
-SERVO_UNITS = 1000  # highest position of a bus servo, that is 240°; readings beyond it are glitches
+SERVO_UNITS = 1000  # highest position of a bus servo, that is 240°
+# Readings of a bus servo that can be true; others are glitches.
+SERVO_RANGES = {
+    "position": (0.0, SERVO_UNITS),
+    "temperature": (0.0, 100.0),  # [°C]
+    "voltage": (4500.0, 9000.0),  # [mV]
+}
 GLITCH_ROWS = 50  # of a run before and after a glitch that are watched
 UNMARKED_FAILURE = "20240325_155003"
 HIRO_EVERY = 4  # rows of HIRO of which one is read: 50 of 200 a second
@@ -120,16 +126,18 @@ def weigand_mats(folder: Path) -> Runs:
 def hiro_runs(folder: Path) -> Runs:
     """Read good and failed snap assemblies: angles, and force and torque at the wrist."""
 
-    def run(path: Path) -> Columns:
-        angles = _numbers(path / "R_Angles.dat")
-        wrench = _numbers(path / "R_Torques.dat")
-        rows = slice(0, min(len(angles), len(wrench)), HIRO_EVERY)
-        force = wrench[rows, 1:4]
-        return numbered(position=angles[rows, 1:], force=force, torque=wrench[rows, 4:])
+    def runs(group: str) -> list[Columns]:
+        return [hiro_run(path.parent) for path in sorted(folder.glob(f"{group}/*/R_Angles.dat"))]
 
-    good = [run(path.parent) for path in sorted(folder.glob("success/*/R_Angles.dat"))]
-    failed = [run(path.parent) for path in sorted(folder.glob("error/*/R_Angles.dat"))]
-    return Runs(good, {"failed": failed})
+    return Runs(runs("success"), {"failed": runs("error")})
+
+
+def hiro_run(folder: Path) -> Columns:
+    """Read one snap assembly."""
+    angles = _numbers(folder / "R_Angles.dat")
+    wrench = _numbers(folder / "R_Torques.dat")
+    rows = slice(0, min(len(angles), len(wrench)), HIRO_EVERY)
+    return numbered(position=angles[rows, 1:], force=wrench[rows, 1:4], torque=wrench[rows, 4:])
 
 
 def _numbers(path: Path) -> NDArray[np.float64]:
@@ -140,36 +148,38 @@ def _numbers(path: Path) -> NDArray[np.float64]:
 def armpi_runs(folder: Path) -> Runs:
     """Read runs of six bus servos; those with marked rows have a heated servo.
 
-    Healthy runs are cut where a reading is a glitch, and each glitch is a run of a few seconds. A run that its
-    authors list as failing, and in which no row is marked, is of neither kind.
+    Runs are cut where a reading is a glitch, and each glitch is a run of a few seconds. A run that its authors list as
+    failing, and in which no row is marked, is left out.
     """
-    healthy: list[Columns] = []
-    heated: list[Columns] = []
-    glitches: list[Columns] = []
+    runs = Runs([], {"heated": [], "glitch": []})
     for path in sorted(folder.glob("matlab_ros_2024/*")):
         if path.name == UNMARKED_FAILURE:
             continue
         motors = [pd.read_csv(path / f"data_motor_{n}.csv") for n in range(1, 7)]
-        run = numbered(**{name: _side_by_side(motors, name) for name in SERVO_CHANNELS})
+        run = numbered(**{name: _side_by_side(motors, name) for name in SERVO_RANGES})
         is_heated = np.asarray(_side_by_side(motors, "label").any(axis=1))
-        if is_heated.any():
-            heated.append({**run, "label": is_heated})
-            continue
-        position = _side_by_side(motors, "position")
-        is_glitch = np.asarray(((position < 0) | (position > SERVO_UNITS)).any(axis=1))
+        is_glitch = np.zeros(len(is_heated), bool)
+        for name, (low, high) in SERVO_RANGES.items():
+            reading = _side_by_side(motors, name)
+            is_outside = (reading < low) | (reading > high)
+            is_glitch |= np.asarray(is_outside.any(axis=1))
         window = np.ones(2 * GLITCH_ROWS + 1)
         is_near = np.convolve(is_glitch, window, "same") > 0
-        labelled = {**run, "label": is_glitch}
-        glitches += [_rows(labelled, *span) for span in spans(is_near)]
-        healthy += [_rows(run, *span) for span in spans(~is_near)]
-    return Runs(healthy, {"heated": heated, "glitch": glitches})
+
+        runs.faulty["glitch"].extend(_parts({**run, "label": is_glitch}, is_near))
+        if not is_heated.any():
+            runs.healthy.extend(_parts(run, ~is_near))
+            continue
+        parts = _parts({**run, "label": is_heated}, ~is_near)
+        runs.faulty["heated"].extend(part for part in parts if part["label"].any())
+    return runs
 
 
-def _rows(run: Columns, start: int, stop: int) -> Columns:
-    return {name: values[start:stop] for name, values in run.items()}
-
-
-SERVO_CHANNELS = ("position", "temperature", "voltage")
+def _parts(run: Columns, is_kept: NDArray[np.bool_]) -> list[Columns]:
+    """Return each stretch of rows (T,) that are kept."""
+    return [
+        {name: values[start:stop] for name, values in run.items()} for start, stop in spans(is_kept)
+    ]
 
 
 def _side_by_side(motors: Iterable[pd.DataFrame], name: str) -> NDArray[np.float64]:

@@ -58,14 +58,14 @@ class Config(kit.Config):
     experiments: tuple[str, ...] = option(tuple(ARMS), quick=("panda",), least=1, known=ARMS)
     """Recordings; missing ones are left out, and named."""
     monitors: tuple[str, ...] = option(
-        ("neural_asm", "association_values", RULE, "gru", "kalman"),
+        ("neural_asm", "association_values", RULE, RULE + BODY, "gru", "kalman"),
         quick=("association_values", RULE),
         least=1,
         known=(*MONITORS, *WITH_BODY, RULE),
     )
     """Monitors; those named with a body read the arm's URDF."""
-    minutes: float = option(0.0)
-    """Most minutes to learn from; 0 for all that there are."""
+    minutes: tuple[float, ...] = option((0.0,), least=1)
+    """Most minutes to learn from, in turn; 0 for all that there are."""
 
 
 class Job(NamedTuple):
@@ -75,6 +75,7 @@ class Job(NamedTuple):
     monitor: str
     seed: int
     fold: int
+    minutes: float = 0.0  # most to learn from; 0 for all
 
 
 def run(config: Config) -> Findings:
@@ -90,9 +91,9 @@ def run(config: Config) -> Findings:
     if not present:
         raise FileNotFoundError("; ".join(missing))
 
-    grid = product(present, config.monitors, config.repetitions, range(FOLDS))
+    grid = product(present, config.monitors, config.repetitions, range(FOLDS), config.minutes)
     jobs = [job for job in map(Job._make, grid) if is_possible(job)]
-    work = partial(examined, folder=config.folder, minutes=config.minutes)
+    work = partial(examined, folder=config.folder)
     records = kit.records_of("watching", work, jobs, config)
     tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
     left_out = "".join(f" Left out: {reason}." for reason in missing)
@@ -116,7 +117,7 @@ class Split(NamedTuple):
     tested: list[Episode]
 
 
-def split(job: Job, runs: Sequence[Episode], minutes: float = 0.0) -> Split:
+def split(job: Job, runs: Sequence[Episode]) -> Split:
     """Cut runs into pieces, and deal them out for one fold."""
     parts = [part for whole in runs for part in complete_parts(whole)]
     cut = parts
@@ -131,9 +132,9 @@ def split(job: Job, runs: Sequence[Episode], minutes: float = 0.0) -> Split:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {piece_s:g} s: too few")
     is_learned = np.arange(len(others)) % 3 > 0
     learned = [cut[i] for i in others[is_learned]]
-    if minutes:
+    if job.minutes:
         ends = np.cumsum([minutes_of([piece]) for piece in learned])
-        learned = learned[: max(1, int((ends <= minutes).sum()))]
+        learned = learned[: max(1, int((ends <= job.minutes).sum()))]
     return Split(
         learned=learned,
         calibration=[cut[i] for i in others[~is_learned]],
@@ -156,11 +157,11 @@ def read_body(folder: Path, arm: RealArm) -> str:
     return read_urdf(path)
 
 
-def examined(job: Job, folder: Path, minutes: float = 0.0) -> list[Record]:
+def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, for each fault in it, and for each labelled fault."""
     arm = ARMS[job.experiment]
     runs, labelled = arm.episodes(folder)
-    use = split(job, runs, minutes)
+    use = split(job, runs)
     urdf = read_body(folder, arm)
     monitor = fitted(job, use.learned, urdf)
     promised = 60.0 / minutes_of(use.calibration)  # the fewest that it can promise [1/h]
@@ -256,40 +257,50 @@ def labelled_results(
     records = []
     for start, stop in spans(is_faulty):
         excess = float(score.value[start:stop].max() / monitor.threshold)
-        records.append({"kind": kind, "added": False, "found": excess > 1, "excess": excess})
+        seconds = (stop - start) * episode.spec.dt
+        record = {"kind": kind, "added": False, "found": excess > 1, "excess": excess}
+        records.append({**record, "seconds": seconds})
     return records
 
 
 def table(records: pd.DataFrame, arm: RealArm) -> Table:
-    """Return the table of a recording, a row for each monitor."""
+    """Return the table of a recording, a row for each monitor and for each length that it learned from."""
+    by_row = records.groupby(["monitor", "minutes"], sort=False)
     healthy = records[records.kind == ""]
-    monitors = records.groupby("monitor", sort=False)
-    pieces_over = (healthy.excess > 1).groupby(healthy.monitor).sum()
-    fewest = int(pieces_over.min())
-    seconds = healthy.seconds.sum() / len(monitors)
+    over = (healthy.excess > 1).groupby([healthy.monitor, healthy.minutes]).sum()
+    fewest = int(over.min())
+    seconds = healthy.seconds.sum() / by_row.ngroups
     caption = (
-        f"{arm.robot} ({arm.place}), {seconds / 60:.1f} min as recorded, learned from "
-        f"{healthy.learned_min.mean():.1f} min. * added to the recording, found within a second. "
-        f"At {fewest}: faults found by the threshold that {fewest} healthy pieces pass."
+        f"{arm.robot} ({arm.place}), {seconds / 60:.1f} min as recorded. * added to the recording, "
+        f"found within a second. At {fewest}: added faults found by the threshold that {fewest} "
+        "healthy pieces pass."
     )
-    return kit.table_of(caption, [monitor_row(name, own, fewest) for name, own in monitors])
+    rows = [monitor_row(name, own, fewest) for (name, _), own in by_row]
+    return kit.table_of(caption, rows)
 
 
 def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]:
     """Return the row of a monitor.
 
-    Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass.
+    Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass. Of labelled stretches of rows
+    some are found by chance, at the rate of false alarms.
     """
     healthy = records[records.kind == ""]
     faulty = records[records.kind != ""]
+    raised = Rate(int(healthy.alarms.sum()), healthy.seconds.sum() / 3600)
     row = {
         "Monitor": name,
+        "learned [min]": f"{healthy.learned_min.mean():.3g}",
         "promised [1/h]": f"{healthy.promised.mean():.0f}",
-        "raised [1/h]": Rate(int(healthy.alarms.sum()), healthy.seconds.sum() / 3600).text,
+        "raised [1/h]": raised.text,
     }
     for kind, own in faulty.groupby("kind", sort=False):
-        star = " *" if own.added.all() else ""
-        row[f"{kind}{star}"] = f"{own.found.astype(int).sum()} of {len(own)}"
+        cell = f"{own.found.astype(int).sum()} of {len(own)}"
+        if own.added.all():
+            row[f"{kind} *"] = cell
+            continue
+        by_chance = 1.0 - np.exp(-raised.value * own.seconds / 3600)
+        row[kind] = f"{cell} ({by_chance.sum():.1f} by chance)"
     row["delay [s]"] = ""
     if records.delay.notna().any():
         row["delay [s]"] = f"{records.delay.median():.3g}"
