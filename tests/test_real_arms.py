@@ -203,3 +203,17 @@ def test_labelled_stretches_are_told_from_those_found_by_chance():
     records = pd.DataFrame([common | healthy, common | labelled, common | labelled])
     expected = 2 * (1 - np.exp(-1.0))  # six false alarms an hour, ten minutes each
     assert monitor_row("any", records, 0)["heated"] == f"2 of 2 ({expected:.1f} by chance)"
+
+
+def test_from_more_minutes_a_monitor_finds_as_many_steps_or_more(monkeypatch, tmp_path):
+    monkeypatch.setattr(arm_recordings, "SYNTHETIC_EPISODES", 160)
+    arm_recordings.synthetic_runs.cache_clear()
+    found = []
+    for minutes in (0.5, 0.0):
+        job = Job("synthetic", "association_values", 0, 0, minutes=minutes)
+        records = pd.DataFrame(examined(job, tmp_path))
+        steps = records[records.kind == "step 20%"]
+        found.append(steps.found.mean())
+    arm_recordings.synthetic_runs.cache_clear()
+    assert found[1] >= found[0]
+    assert found[1] > 0.5

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode
 from asm_gym.readings import spans
+from asm_gym.rollouts.run_trials import collect
 
 Columns = dict[str, NDArray[Any]]
 
@@ -32,6 +34,9 @@ SERVO_RANGES = {
 GLITCH_ROWS = 50  # of a run before and after a glitch that are watched
 UNMARKED_FAILURE = "20240325_155003"
 HIRO_EVERY = 4  # rows of HIRO of which one is read: 50 of 200 a second
+HIRO_REPEATED = slice(3, 19)  # good runs of HIRO, numbered from 2, that repeat one programme
+SYNTHETIC_EPISODES = 1920  # of 4 s: 128 min, half of which are learned from
+SYNTHETIC_EVERY = 4  # rows of the synthetic arm of which one is read: 25 of 100 a second
 
 
 @dataclass(frozen=True)
@@ -132,6 +137,12 @@ def hiro_runs(folder: Path) -> Runs:
     return Runs(runs("success"), {"failed": runs("error")})
 
 
+def hiro_repetitions(folder: Path) -> Runs:
+    """Read the good assemblies of one programme, runs 5 to 20, whose angles differ by less than 0.0003 rad."""
+    runs = hiro_runs(folder)
+    return Runs(runs.healthy[HIRO_REPEATED], runs.faulty)
+
+
 def hiro_run(folder: Path) -> Columns:
     """Read one snap assembly."""
     angles = _numbers(folder / "R_Angles.dat")
@@ -186,6 +197,21 @@ def _side_by_side(motors: Iterable[pd.DataFrame], name: str) -> NDArray[np.float
     return np.stack([motor[name].to_numpy(np.float64) for motor in motors], axis=1)
 
 
+@cache
+def synthetic_runs(_: Path) -> Runs:
+    """Simulate episodes of the synthetic arm, each through poses of its own, with a load of its own."""
+    episodes = collect(
+        "asm_gym/SyntheticArm-v0", "scripted", episodes=SYNTHETIC_EPISODES, seed=0, workers=1
+    )
+    runs = []
+    for episode in episodes:
+        rows = episode.stream[::SYNTHETIC_EVERY]
+        position, velocity, effort, command = np.split(rows, 4, axis=1)
+        run = numbered(position=position, velocity=velocity, effort=effort, command=command)
+        runs.append(run)
+    return Runs(runs)
+
+
 SECONDS = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
 ARMS = {
     "panda": RealArm(
@@ -231,6 +257,16 @@ ARMS = {
         efforts=("force", "torque"),
         has_joint_torques=False,
     ),
+    "hiro_repeated": RealArm(
+        robot="Kawada HIRO, one programme",
+        place="hiro_snap_assembly",
+        source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
+        read=hiro_repetitions,
+        piece_s=np.inf,
+        rate=50.0,
+        efforts=("force", "torque"),
+        has_joint_torques=False,
+    ),
     "armpi": RealArm(
         robot="ArmPi FPV",
         place="armpi_fpv_faults",
@@ -242,5 +278,14 @@ ARMS = {
         slip=SLIP_RAD * SERVO_UNITS / np.deg2rad(240),
         has_joint_torques=False,
     ),
+    "synthetic": RealArm(
+        robot="Synthetic arm",
+        place="",
+        source="simulated",
+        read=synthetic_runs,
+        piece_s=np.inf,
+        rate=25.0,
+    ),
 }
-"""Sets by name; the first three are of seconds, the others of minutes."""
+"""Sets by name; the first three are of seconds, the others of minutes, and the last one is simulated."""
+REAL = tuple(name for name in ARMS if ARMS[name].place)
