@@ -50,7 +50,7 @@ ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
 DRIVE_LOST_KEPT = 0.97  # share of w from substep to substep: half of it in 45 ms
 LEAST_DRIVE_LOST = 0.02  # w from which on an arm counts as braked
 LEAST_SPEED = 1e-9  # no speed is divided by less [m/s]
-LEAST_INVERSE_MASS = 1e-3  # of a point that some directions cannot move [1/kg]
+LEAST_INVERSE_MASS = 1e-4  # of a point that some directions cannot move [1/kg]
 
 # Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].
 BESIDE_BASE = 0.3
