@@ -40,7 +40,7 @@ def stopping_impulse(simulation, body, place, velocity):
     rows = np.repeat(np.arange(model.nv), model.M_rownnz)
     mass[rows, model.M_colind] = mass[model.M_colind, rows] = data.M
     inverse = jacobian @ np.linalg.solve(mass, jacobian.T)
-    return np.linalg.norm(np.linalg.solve(inverse + 1e-3 * np.eye(3), velocity))
+    return np.linalg.norm(np.linalg.solve(inverse + 1e-4 * np.eye(3), velocity))
 
 
 def hand_momentum(simulation, arm, twist):
