@@ -1,11 +1,11 @@
-"""What does not give way near an arm: its directions, and that only motion towards it is slowed down."""
+"""What is near an arm: where, and that only motion towards it is slowed down."""
 
 import mujoco
 import numpy as np
 import pytest
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.envs.mujoco_views import ARM, EVERYWHERE, records
+from asm_gym.envs.mujoco_views import ARM, records
 from asm_gym.envs.obstacles import NEAR, Obstacles
 
 LOW = (-0.8, -0.8, -0.2)
@@ -35,68 +35,67 @@ def world():
     return model, data, Obstacles(model, data, arms)
 
 
-def directions_at(world, place):
-    """Return the unit vectors to what is near a hand at a place; None where it is near on all sides."""
+def points_at(world, place):
+    """Return what is near a hand at a place, by way."""
     model, data, obstacles = world
     data.mocap_pos[0] = place
     data.ncon = 0
     mujoco.mj_kinematics(model, data)
     obstacles.look()
-    count = obstacles.ahead.counts[0, 0]
-    if count == EVERYWHERE:
-        return None
-    return obstacles.ahead.directions[0, 0, :count, :3]
+    return noted(obstacles)
 
 
-def test_directions_are_those_of_the_nearest_points_that_mujoco_finds(world):
+def noted(obstacles):
+    """Return (N,) what was near the hand when obstacles looked last."""
+    return obstacles.ahead.points[0, 0, : obstacles.ahead.counts[0, 0]]
+
+
+def test_points_are_the_nearest_of_all_that_is_near(world):
     model, data, _ = world
     rng = np.random.default_rng(0)
     hand = model.geom("hand").id
-    fixed = [
-        model.geom("floor").id,
-        *(model.body(name).geomadr[0] for name in ("wall", "door")),
-    ]
+    others = [geom for geom in range(model.ngeom) if geom != hand]
     seen = 0
     for _ in range(2000):
-        found = directions_at(world, rng.uniform(LOW, HIGH))
+        found = points_at(world, rng.uniform(LOW, HIGH))
         expected = []
-        touches = False
-        for geom in fixed:
-            points = np.zeros(6)
-            distance = mujoco.mj_geomDistance(model, data, hand, geom, 1.0, points)
-            touches |= distance < 0.0
-            if distance < NEAR:
-                way = points[3:] - points[:3]
-                expected.append(way / np.linalg.norm(way))
-        if touches or not expected:
-            continue
-        assert found is not None
+        for geom in others:
+            ends = np.zeros(6)
+            gap = mujoco.mj_geomDistance(model, data, hand, geom, NEAR, ends)
+            if gap < NEAR:
+                way = (ends[3:] - ends[:3]) * np.sign(gap)
+                expected.append([gap, *ends[:3], *way / np.linalg.norm(way)])
         assert len(found) == len(expected)
-        np.testing.assert_allclose(np.sort(found, axis=0), np.sort(expected, axis=0), atol=1e-3)
-        seen += 1
-    assert seen > 20
+        for point, (gap, *rest) in zip(found, expected, strict=True):
+            assert point.gap == pytest.approx(gap)
+            np.testing.assert_allclose([*point.place, *point.way], rest, atol=1e-9)
+        seen += len(found)
+    assert seen > 100
 
 
 def test_what_the_hand_touches_is_no_obstacle_and_belongs_to_the_hand(world):
     model, data, obstacles = world
-    assert len(directions_at(world, [0.0, 0.35, 0.5])) == 1  # 1 cm from the ball
+    assert len(points_at(world, [0.0, 0.35, 0.5])) == 1  # 1 cm from the ball
     data.mocap_pos[0] = [0.0, 0.37, 0.5]
     mujoco.mj_forward(model, data)
     assert data.ncon == 1
     obstacles.look()
-    assert obstacles.ahead.counts[0, 0] == 0
+    assert len(noted(obstacles)) == 0
 
     data.qpos[2] = 0.12  # the ball is 2 cm above the floor, and the hand touches it from above
     data.mocap_pos[0] = [0.0, 0.5, 0.25]
     mujoco.mj_forward(model, data)
     obstacles.look()
-    down = obstacles.ahead.directions[0, 0, :1, :3]
-    assert obstacles.ahead.counts[0, 0] == 1
-    np.testing.assert_allclose(down, [[0, 0, -1]], atol=1e-6)
+    (point,) = noted(obstacles)
+    np.testing.assert_allclose(point.way, [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(point.place, [0, 0.5, 0.02], atol=1e-6)
+    assert point.gap == pytest.approx(0.02)
 
 
-def test_a_hand_within_an_obstacle_is_near_it_on_all_sides(world):
-    assert directions_at(world, [0.0, -0.5, 0.5]) is None
+def test_a_hand_within_an_obstacle_moves_towards_it_as_it_goes_deeper(world):
+    (point,) = points_at(world, [0.0, -0.54, 0.5])
+    assert point.gap < 0.0
+    np.testing.assert_allclose(point.way, [0, 1, 0], atol=1e-6)
 
 
 def test_an_arm_is_slowed_down_on_its_way_to_the_table_and_not_away_from_it(lift):

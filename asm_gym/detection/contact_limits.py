@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.hand_speed import NO_SPEED_LIMIT, Floats, SpeedLimit, allowed_share
+from asm_gym.detection.hand_speed import FREE, NO_SPEED_LIMIT, Floats, SpeedLimit, allowed_share
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
@@ -50,7 +50,8 @@ class ContactLimits:
         momentum: of each link, the impulse that stops it [N s]; that of ``pace`` counts too. Infinite for no other.
         healthy: largest values in healthy motion of this body and task, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; a larger one replaces the limit. Empty if unknown.
-        pace: higher speeds where healthy hands were faster; None for no such places.
+        pace: higher speeds where healthy hands were faster, and twice ``hand_speed`` where nothing is near, as far as
+            the environment knows where things are; None for neither.
         stays: hold the arm from the physics substep after a limit was passed; False only reports.
 
     Raises:
@@ -129,7 +130,9 @@ class ContactLimits:
     def speed_limit(self) -> SpeedLimit:
         """Return the limits of the hands' speed, as compiled code reads them."""
         limit = NO_SPEED_LIMIT._replace(
-            hand_speed=float(self.hand_speed), momentum=float(self.momentum)
+            hand_speed=float(self.hand_speed),
+            free_speed=float(self.hand_speed),
+            momentum=float(self.momentum),
         )
         if self.pace is None:
             return limit
@@ -137,15 +140,23 @@ class ContactLimits:
         return limit._replace(
             grid=self.pace.grid,
             low=self.pace.low,
+            free_speed=FREE * limit.hand_speed,
             momentum=momentum,
+            pace_momentum=self.pace.pace_momentum,
             least_upright=self.pace.least_upright,
         )
 
     def share(
-        self, arm: int, place: Floats, twist: Floats, speed: float, momentum: float = 0.0
+        self,
+        arm: int,
+        place: Floats,
+        twist: Floats,
+        speed: float,
+        soon: float = 1.0,
+        momentum: float = 0.0,
     ) -> float:
         """Return the share that a hand may have of a motion; see ``hand_speed.allowed_share``."""
-        return allowed_share(self.speed_limit(), arm, place, twist, speed, momentum)
+        return allowed_share(self.speed_limit(), arm, place, twist, speed, soon, momentum)
 
 
 def healthy_forces(

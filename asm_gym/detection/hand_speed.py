@@ -1,13 +1,15 @@
-"""How much of a motion a hand may make, by its place and direction.
+"""How much of a motion a hand may make, by its place and direction, and by how near it is to something.
 
 Near a place where healthy hands went at most as fast as g along each axis, a hand may make the share s of a motion v:
 
-    s = max(min(L / |v|, P / p), k),      k = min_i (1.25 g_i + slack_i) / |v_i|
+    s = max(min(L' / |v|, P / p), min(k, P' / p)),      k = min_i (1.25 g_i + slack_i) / |v_i|
 
-v (6,) is a twist, linear then angular [m/s], [rad/s]; |v| the speed of the hand's fastest point [m/s], and L its usual
-limit; p the momentum of the arm behind it, and P its limit [N s]. Downwards, where what a
-hand meets is hard, k allows at most L, and at most 1.05 times the speed of healthy hands. In tasks whose healthy hands
-point down all the time, k counts only for hands that do so: one that is tilted meets things with other parts.
+v (6,) is a twist, linear then angular [m/s], [rad/s]; |v| the speed of the hand's fastest point [m/s]. L' is the usual
+limit L, up to ``FREE`` times as much the farther away everything is. p is the momentum of the arm on its way to
+something [N s], P its limit where no healthy hand was and P' where one was: none in a task that is known. Downwards,
+where what a hand meets is hard, k allows at most L, and at most 1.05 times the speed of healthy hands. In tasks whose
+healthy hands point down all the time, k counts only for hands that do so: one that is tilted meets things with other
+parts.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ ABOVE_HEALTHY = 1.25
 ABOVE_HEALTHY_DOWN = 1.05  # the same downwards
 SPEED_SLACK = np.array([0.03, 0.03, 0.03, 0.15, 0.15, 0.15])  # and by so much faster [m/s], [rad/s]
 DOWN_SLACK = 0.03  # downwards as fast as this, whatever healthy hands did [m/s]
+FREE = 2.0  # where nothing is near a hand may go so many times as fast
 LEAST_SPEED = 1e-9  # no speed is divided by less [m/s]
 
 
@@ -40,7 +43,9 @@ class SpeedLimit(NamedTuple):
     grid: NDArray[np.float32]
     low: NDArray[np.int64]  # (4,) arm and place of the grid's first cell
     hand_speed: float  # the usual limit [m/s]
+    free_speed: float  # the same where nothing is near [m/s]
     momentum: float  # the limit where no healthy hand was [N s]
+    pace_momentum: float  # and where one was [N s]
     least_upright: float  # cosine of the greatest tilt of a hand that goes as fast as healthy ones
 
 
@@ -48,7 +53,9 @@ NO_SPEED_LIMIT = SpeedLimit(
     grid=np.zeros((0, 1, 1, 1, 2 * AXES), np.float32),
     low=np.zeros(4, np.int64),
     hand_speed=np.inf,
+    free_speed=np.inf,
     momentum=np.inf,
+    pace_momentum=np.inf,
     least_upright=-1.0,
 )
 
@@ -89,10 +96,20 @@ def healthy_share(limit: SpeedLimit, arm: int, place: Floats, twist: Floats) -> 
 
 
 @compiled
-def usual_share(limit: SpeedLimit, speed: float, momentum: float) -> float:
+def usual_share(limit: SpeedLimit, speed: float, soon: float, momentum: float) -> float:
     """Return the share that a hand may have of a motion where no healthy hand was; see ``allowed_share``."""
-    share = limit.hand_speed / max(speed, LEAST_SPEED)
+    allowed = min(limit.free_speed, limit.hand_speed / max(soon, LEAST_SPEED))
+    share = allowed / max(speed, LEAST_SPEED)
     return min(share, limit.momentum / max(momentum, LEAST_SPEED))
+
+
+@compiled
+def paced_share(
+    limit: SpeedLimit, arm: int, place: Floats, twist: Floats, share: float, momentum: float
+) -> float:
+    """Return the greater of the usual share of a motion and that of healthy hands; see ``allowed_share``."""
+    paced = healthy_share(limit, arm, place, twist)
+    return max(share, min(paced, limit.pace_momentum / max(momentum, LEAST_SPEED)))
 
 
 @compiled
@@ -102,6 +119,7 @@ def allowed_share(
     place: Floats,
     twist: Floats,
     speed: float,
+    soon: float,
     momentum: float,
 ) -> float:
     """Return s, the share that a hand may have of a motion; above 1 where it may go faster.
@@ -112,9 +130,10 @@ def allowed_share(
         place: (3,) of the hand [m].
         twist: (6,) of the hand, linear and angular [m/s], [rad/s].
         speed: of the hand's fastest point [m/s].
-        momentum: of the arm in its motion [N s]; 0 where it is not known.
+        soon: how soon it touches something, 1 for at once and 0 for nothing that is near.
+        momentum: of the arm on its way to something [N s]; 0 where it is not known.
     """
-    share = usual_share(limit, speed, momentum)
+    share = usual_share(limit, speed, soon, momentum)
     if limit.grid.size == 0:
         return share
-    return max(share, healthy_share(limit, arm, place, twist))
+    return paced_share(limit, arm, place, twist, share, momentum)

@@ -38,7 +38,7 @@ ODD_EPISODES = 0.002
 MOMENTUM_OF_KNOWN_TASK = 2.0
 """Limit of a hand or link where no healthy hand was, in a task with a map of its own: 13 kg at the usual speed [N s].
 MuJoCo's contacts answer with at most 105/s times that."""
-MOMENTUM = 4.0  # the same in other tasks, whose hands have to go where none was [N s]
+MOMENTUM = 2.5  # the limit in other tasks, everywhere [N s]
 
 TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
 TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
@@ -53,6 +53,7 @@ class HandSpeedMap:
     Args:
         cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of the momentum of an arm's hand and links, where no healthy hand was [N s].
+        pace_momentum: the same where one was; infinite in a task that is known.
         earned: (N, 16) speeds that hands have earned under a guard (``guard.earned_speed``).
 
     Raises:
@@ -68,6 +69,7 @@ class HandSpeedMap:
         self,
         cells: AnyFloats,
         momentum: float = MOMENTUM,
+        pace_momentum: float = MOMENTUM,
         earned: AnyFloats = NOTHING_EARNED,
     ) -> None:
         if not _are_cells(cells) or (len(earned) and not _are_cells(earned)):
@@ -77,6 +79,7 @@ class HandSpeedMap:
             )
         self.cells = cells
         self.momentum = momentum
+        self.pace_momentum = pace_momentum
         self.earned = earned
 
         all_cells = np.concatenate((cells, earned))
@@ -106,14 +109,14 @@ class HandSpeedMap:
     ) -> Self | None:
         """Return the map of a task; that of all tasks where it has none, None where there are no cells."""
         if task and task in cells_by_task:
-            return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK)
+            return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK, np.inf)
         if not cells_by_task:
             return None
         return cls(np.concatenate(list(cells_by_task.values())))
 
     def with_earned(self, earned: AnyFloats) -> Self:
         """Return the map with other speeds (N, 16) that hands have earned."""
-        return type(self)(self.cells, self.momentum, earned)
+        return type(self)(self.cells, self.momentum, self.pace_momentum, earned)
 
     @classmethod
     def by_task(

@@ -3,11 +3,16 @@
 Of its present motion q̇ an arm may have the share s, the least of
 
     L / fastest point                     L: the speed that its action was slowed down to
-    max(min(L₀ / |v|, P / p), k)          v: its hand's twist; see ``detection.hand_speed``
+    what its hand may have of its twist   see ``detection.hand_speed``
 
-where p is the largest impulse |Λ v| that stops a link on its way to something near (``obstacles``), Λ⁻¹ = J M⁻¹ Jᵀ:
-what a link pushes with that meets something hard and does not slide, be it a forearm on the robot's own pedestal.
-Beyond that the motors slow the arm down,
+where the momentum p is the largest of the impulses |Λ v| that stop a point of a link which is near something
+(``obstacles``), as far as it counts; Λ⁻¹ = J M⁻¹ Jᵀ. Such an impulse is what a link pushes with that meets something
+hard and does not slide, be it a forearm on the robot's own pedestal. At a distance g, approached with the speed c, it
+counts
+
+    min(1, T c / g)                       T: a control step, and what it takes to brake
+
+since a point that would not touch within T can still be braked. Beyond its share the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -18,11 +23,12 @@ A motor that delivers less torque than it was commanded is commanded so much mor
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from asm_gym.compilation import inner
-from asm_gym.detection.hand_speed import SpeedLimit, healthy_share, usual_share
+from asm_gym.detection.hand_speed import SpeedLimit, paced_share, usual_share
 from asm_gym.envs.controllers import (
     cholesky,
     command,
@@ -44,6 +50,9 @@ from asm_gym.envs.mujoco_views import (
     Work,
 )
 
+SOON_S = 0.065  # T
+LEAST_GAP = 1e-3  # [m]
+SLIDES = 0.01  # a point that comes nearer by less slides along [m/s]
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
 ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
@@ -103,51 +112,45 @@ def fastest_point(views: Views, arm: Arm) -> float:
 
 
 @partial(inner, inlined=True)
-def hardest_link(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> float:
-    """Return p, the largest momentum of a link of arm ``a`` on its way to an obstacle [N s].
+def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[float, float]:
+    """Return how soon a link of arm ``a`` touches an obstacle, and p, the largest momentum that counts [N s].
 
     ``work.factor`` is the Cholesky factor of the arm's mass matrix.
     """
+    soonest = 0.0
     hardest = 0.0
     n = 0
     while arm.links[n] >= 0:
-        if ahead.counts[a, n] != 0 and link_approaches(views, arm, a, n, ahead):
-            momentum = link_momentum(views, arm, n, work)
-            hardest = max(hardest, momentum)
+        if ahead.counts[a, n] == EVERYWHERE:
+            soonest = 1.0
+            place = place_of(views, arm, n)
+            hardest = max(hardest, point_momentum(views, arm, n, place, work))
+        for k in range(ahead.counts[a, n]):
+            point = ahead.points[a, n, k]
+            origin = views.subtree_com[arm.root]
+            x, y, z = velocity_at(views.cvel[arm.links[n]], point.place, origin)
+            soon = how_soon(point, x, y, z)
+            if soon > 0.0:
+                momentum = point_momentum(views, arm, n, point.place, work)
+                soonest = max(soonest, soon)
+                hardest = max(hardest, soon * momentum)
         n += 1
-    return hardest
-
-
-@partial(inner, inlined=True)
-def link_approaches(views: Views, arm: Arm, a: int, n: int, ahead: Ahead) -> bool:
-    """Whether a link of arm ``a`` is on its way to an obstacle."""
-    motion = views.cvel[arm.links[n]]
-    place = place_of(views, arm, n)
-    x, y, z = velocity_at(motion, place, views.subtree_com[arm.root])
-    turning = length(motion[:3])
-    return approaches(ahead.counts[a, n], ahead.directions[a, n], x, y, z, turning)
+    return soonest, hardest
 
 
 @inner
-def approaches(
-    count: int, directions: Floats, x: float, y: float, z: float, turning: float
-) -> bool:
-    """Whether a link with a velocity [m/s], that turns by so much [rad/s], comes nearer to an obstacle."""
-    if count == EVERYWHERE:
-        return True
-    for k in range(count):
-        way = directions[k]
-        closing = way[0] * x + way[1] * y + way[2] * z
-        if closing + way[3] * turning > 0.0:
-            return True
-    return False
+def how_soon(point: Any, x: float, y: float, z: float) -> float:
+    """Return how soon a point near an obstacle touches it that moves so fast [m/s]: 1 for within T, 0 for never."""
+    closing = point.way[0] * x + point.way[1] * y + point.way[2] * z
+    if closing < SLIDES:
+        return 0.0
+    return min(1.0, SOON_S * closing / max(point.gap, LEAST_GAP))
 
 
 @partial(inner, inlined=True)
-def link_momentum(views: Views, arm: Arm, n: int, work: Work) -> float:
-    """Return |Λ v|, what stops the origin of a link [N s]."""
+def point_momentum(views: Views, arm: Arm, n: int, place: Floats, work: Work) -> float:
+    """Return |Λ v|, what stops a link at a place (3,) [N s]."""
     origin = views.subtree_com[arm.root]
-    place = place_of(views, arm, n)
     velocity = work.momentum
     x, y, z = velocity_at(views.cvel[arm.links[n]], place, origin)
     velocity[0] = x
@@ -186,14 +189,14 @@ def stopping_impulse(inverse_mass: Floats, factor: Floats, velocity: Floats) -> 
 
 @partial(inner, inlined=True)
 def share_at(
-    views: Views, arm: Arm, a: int, limit: SpeedLimit, twist: Floats, momentum: float
+    views: Views, arm: Arm, a: int, limit: SpeedLimit, twist: Floats, soon: float, momentum: float
 ) -> float:
     """Return the share that arm ``a`` may have of a motion of its hand, a twist (6,), where the hand is now."""
-    share = usual_share(limit, twist_speed(twist), momentum)
+    share = usual_share(limit, twist_speed(twist), soon, momentum)
     upright = -views.site_xmat[arm.site, 8]  # 1 for a hand that points down
     if limit.grid.size > 0 and upright >= limit.least_upright:
         place = views.site_xpos[arm.site]
-        share = max(share, healthy_share(limit, a, place, twist))
+        share = paced_share(limit, a, place, twist, share, momentum)
     return share
 
 
@@ -207,11 +210,12 @@ def present_share(
         twist[axis] = 0.0
         for i in range(arm.joint_count):
             twist[axis] += work.jacobian[axis, i] * work.velocities[i]
+    soon = 1.0
     momentum = 0.0
     if limit.momentum < np.inf:
         cholesky(work.mass, arm.joint_count, work.factor)
-        momentum = hardest_link(views, arm, a, ahead, work)
-    return share_at(views, arm, a, limit, twist, momentum)
+        soon, momentum = approach(views, arm, a, ahead, work)
+    return share_at(views, arm, a, limit, twist, soon, momentum)
 
 
 @partial(inner, inlined=True)

@@ -10,12 +10,9 @@ the quantity a momentum observer estimates (Haddadin, De Luca, Albu-Schäffer 20
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
-from llvmlite import binding
 from numba import types
 from numpy.typing import NDArray
 
@@ -42,6 +39,7 @@ from asm_gym.envs.mujoco_views import (
     SubstepLimits,
     Views,
     Work,
+    link_library,
 )
 
 # Parts of one arm's sample in a substep; those that have limits come first.
@@ -58,8 +56,7 @@ _VELOCITY = VELOCITY.start
 
 OBSERVED_BOUND = 100.0  # of observations; nothing that a task does comes near it
 
-# MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
-binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
+link_library()
 _on_data = types.void(types.intp, types.intp)
 _step1: Any = types.ExternalFunction("mj_step1", _on_data)
 _step2: Any = types.ExternalFunction("mj_step2", _on_data)

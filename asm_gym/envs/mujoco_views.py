@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from llvmlite import binding
 from numpy.typing import NDArray
 
 from asm_gym.detection.hand_speed import SpeedLimit
@@ -17,7 +19,7 @@ MOST_BODIES = 48  # the most bodies, or dofs, of a robot with its gripper
 # numbers that limits apply to: external torque of the joints, then force at the wrist
 FELT = JOINTS + 3
 
-DIRECTIONS = 8  # the most in which a link is near something; with more it counts as surrounded
+NEAR_POINTS = 8  # the most of a link that are kept, those nearest to something
 EVERYWHERE = -1  # in the place of their number: the link is surrounded
 
 # Controllers that run compiled.
@@ -28,6 +30,12 @@ JOINT_POSITION = 1
 UNKNOWN_CHANGE = 0
 JOINT_ANGLES = 1
 HAND_POSE = 2
+
+
+def link_library() -> None:
+    """Let compiled code call MuJoCo's own functions, linked by name so that it can be cached on disk."""
+    folder = Path(mujoco.__file__).parent
+    binding.load_library_permanently(str(next(folder.glob("libmujoco*"))))
 
 
 class Views(NamedTuple):
@@ -195,19 +203,29 @@ STATUS = np.dtype(
 MotionLimits = tuple[SpeedLimit, SpeedLimit]  # of hands, and of those beside their own base
 
 
-class Ahead(NamedTuple):
-    """In which directions the links of arms are near an obstacle; see ``obstacles``. Changed in place."""
+NEAR_POINT = np.dtype(
+    [
+        ("place", np.float64, 3),  # of the link, where it is nearest to something [m]
+        ("way", np.float64, 3),  # from there to the obstacle, a unit vector
+        ("gap", np.float64),  # how far it is [m]
+    ]
+)
+"""Where a link is near an obstacle."""
 
-    counts: Ints  # (A, MOST_BODIES) how many directions there are, or ``EVERYWHERE``
-    # (A, MOST_BODIES, DIRECTIONS, 4) unit vector, and how far the link reaches from its origin [m]
-    directions: Floats
+
+class Ahead(NamedTuple):
+    """Where the links of arms are near obstacles; see ``obstacles``. Changed in place."""
+
+    counts: Ints  # (A, MOST_BODIES) how many points of each link are, or ``EVERYWHERE``
+    points: Any  # (A, MOST_BODIES, NEAR_POINTS) of NEAR_POINT
 
     @classmethod
     def everywhere(cls, arms: int) -> Ahead:
         """Return arrays that say of each link that something is near it on all sides."""
+        points = np.zeros((arms, MOST_BODIES, NEAR_POINTS), NEAR_POINT)
         return cls(
             counts=np.full((arms, MOST_BODIES), EVERYWHERE, np.int64),
-            directions=np.zeros((arms, MOST_BODIES, DIRECTIONS, 4)),
+            points=points.view(np.recarray),
         )
 
 

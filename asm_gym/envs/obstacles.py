@@ -1,8 +1,9 @@
 """Where an arm might meet something: only towards it is the arm's momentum limited.
 
-Around each geom of the arm there is a ball, and around each geom of anything else a box. The directions to boxes that
-are within ``NEAR`` of a ball are noted in every control step, and compared with the motion in every substep. What the
-hand touches and can be carried belongs to the hand: it is no obstacle, and meets others.
+Around each geom of the arm there is a ball, and around each geom of anything else a box. Of pairs whose ball and box
+are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the speed of the arm's
+point towards the other's tells how soon they would touch. What the hand touches and can be carried belongs to the hand:
+it is no obstacle, and meets others.
 """
 
 from __future__ import annotations
@@ -11,28 +12,35 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.envs.mujoco_views import DIRECTIONS, EVERYWHERE, Ahead, Arms, Floats
+from asm_gym.envs.controllers import length
+from asm_gym.envs.mujoco_views import NEAR_POINTS, Ahead, Arm, Arms, Floats, Ints, link_library
 
-# At 0.5 m/s an arm goes half of it in a control step of 50 ms [m].
-NEAR = 0.05
-# From the hand to the middle of a geom of its gripper, or of what it carries [m].
-FROM_HAND = 0.15
+# Beyond it nothing is touched within a control step of 50 ms at 1 m/s [m].
+NEAR = 0.06
 
-Ids = NDArray[np.int64]
+link_library()
+_distance: Any = types.ExternalFunction(
+    "mj_geomDistance",
+    types.float64(types.intp, types.intp, types.int32, types.int32, types.float64, types.intp),
+)
 
 
 class ArmGeoms(NamedTuple):
     """Geoms that one arm may bring together; arrays of MuJoCo are not copied."""
 
-    links: Ids  # (ngeom,) index of the link that carries each geom, from the hand on; else -1
-    own: Ids  # (G,) geoms of the arm
-    others: Ids  # (O,) other geoms
+    model: int  # its address
+    data: int  # its address
+    links: Ints  # (ngeom,) index of the link that carries each geom, from the hand on; else -1
+    own: Ints  # (G,) geoms of the arm
+    others: Ints  # (O,) other geoms
+    bodies: NDArray[np.int32]  # (ngeom,) that have the geoms
+    parents: NDArray[np.int32]  # (nbody,) that carry the bodies
     carriable: NDArray[np.int32]  # (ngeom,) the body that lies freely and has the geom; else -1
     radii: Floats  # (ngeom,) of the ball around each geom [m]
-    reaches: Floats  # (ngeom,) how far each geom of the arm reaches from the origin of its link [m]
     boxes: Floats  # (ngeom, 6) centre and half edges of the box around each, in its frame [m]
     places: Floats  # (ngeom, 3)
     frames: Floats  # (ngeom, 9)
@@ -43,15 +51,17 @@ class ArmGeoms(NamedTuple):
         collides = (model.geom_contype | model.geom_conaffinity) != 0
         link_of = np.array([_link_of(model, arms[a], body) for body in range(model.nbody)])
         link_of_geom = link_of[model.geom_bodyid]
-        own = np.flatnonzero(collides & (link_of_geom >= 0))
         free_bodies = [_free_body(model, body) for body in range(model.nbody)]
         return cls(
+            model=model._address,
+            data=data._address,
             links=link_of_geom,
-            own=own,
+            own=np.flatnonzero(collides & (link_of_geom >= 0)),
             others=np.flatnonzero(collides & (link_of_geom < 0)),
+            bodies=model.geom_bodyid,
+            parents=model.body_parentid,
             carriable=np.array(free_bodies, np.int32)[model.geom_bodyid],
             radii=model.geom_rbound,
-            reaches=_reaches(model, arms[a]),
             boxes=model.geom_aabb,
             places=data.geom_xpos,
             frames=data.geom_xmat,
@@ -59,7 +69,7 @@ class ArmGeoms(NamedTuple):
 
 
 class Obstacles:
-    """Tells in which directions the links of the arms are near obstacles.
+    """Tells where the links of the arms are near obstacles.
 
     Args:
         model: a loaded model.
@@ -67,12 +77,13 @@ class Obstacles:
         arms: its arms.
 
     Attributes:
-        ahead: these directions when ``look`` was called last.
+        ahead: these places when ``look`` was called last.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, arms: Arms) -> None:
         self._data = data
         self._is_carried = np.zeros(model.nbody, np.bool_)
+        self._ends = np.zeros((2, 3))
         self._geoms = [ArmGeoms.of(model, data, arms, a) for a in range(len(arms))]
         self.ahead = Ahead.everywhere(len(arms))
 
@@ -80,26 +91,17 @@ class Obstacles:
         """Write where the arms are now."""
         touching = self._data.contact.geom
         for a, geoms in enumerate(self._geoms):
-            note_ahead(
-                geoms, touching, self._is_carried, self.ahead.counts[a], self.ahead.directions[a]
-            )
+            note_ahead(geoms, touching, self._is_carried, self._ends, self.ahead, a)
 
 
-def _link_of(model: mujoco.MjModel, arm: Any, body: int) -> int:
+def _link_of(model: mujoco.MjModel, arm: Arm, body: int) -> int:
     """Return the index of the link of an arm that carries a body; -1 for none."""
     links = arm.links.tolist()
     while body > 0:
         if body in links:
-            return links.index(body)
+            return int(links.index(body))
         body = int(model.body_parentid[body])
     return -1
-
-
-def _reaches(model: mujoco.MjModel, arm: Any) -> Floats:
-    """Return (ngeom,) how far the ball around each geom reaches from the origin of the link that carries it [m]."""
-    centres = np.linalg.norm(model.geom_pos, axis=1)
-    is_of_link = np.isin(model.geom_bodyid, arm.links)
-    return np.asarray(model.geom_rbound + np.where(is_of_link, centres, FROM_HAND))
 
 
 def _free_body(model: mujoco.MjModel, body: int) -> int:
@@ -117,24 +119,27 @@ def note_ahead(
     arm: Any,
     touching: NDArray[np.int32],
     is_carried: NDArray[np.bool_],
-    counts: Ids,
-    directions: Floats,
+    ends: Floats,
+    ahead: Ahead,
+    a: int,
 ) -> None:
-    """Write in which directions the links of an arm are near something.
+    """Write where the links of arm ``a`` are near something.
 
     Args:
         arm: its ``ArmGeoms``.
         touching: (N, 2) geoms that touch.
         is_carried: (nbody,) scratch: the hand touches the body.
-        counts: (MOST_BODIES,) as in ``Ahead``, as are the directions.
+        ends: (2, 3) scratch: the nearest points of two geoms.
+        ahead: written to.
+        a: index of the arm.
     """
-    counts[:] = 0
+    ahead.counts[a, :] = 0
     note_carried(arm, touching, is_carried)
     for geom in arm.own:
-        note_geom(arm, geom, arm.links[geom], is_carried, counts, directions)
+        note_geom(arm, geom, arm.links[geom], is_carried, ends, ahead, a)
     for geom in arm.others:
         if arm.carriable[geom] >= 0 and is_carried[arm.carriable[geom]]:
-            note_geom(arm, geom, 0, is_carried, counts, directions)
+            note_geom(arm, geom, 0, is_carried, ends, ahead, a)
 
 
 @inner
@@ -154,45 +159,62 @@ def note_geom(
     geom: int,
     link: int,
     is_carried: NDArray[np.bool_],
-    counts: Ids,
-    directions: Floats,
+    ends: Floats,
+    ahead: Ahead,
+    a: int,
 ) -> None:
-    """Note the directions in which a geom of a link is near something."""
-    way = np.zeros(3)
+    """Note the points of a geom of a link that are near something."""
     for other in arm.others:
-        if counts[link] == EVERYWHERE:
-            return
-        if arm.carriable[other] >= 0 and is_carried[arm.carriable[other]]:
+        body = arm.carriable[other]
+        if body >= 0 and is_carried[body]:
             continue
-        apart = write_way(arm, geom, other, way)
-        if apart - arm.radii[geom] > NEAR:
+        # A link turns on the one that carries it, and never meets it.
+        if arm.parents[arm.bodies[geom]] == arm.bodies[other]:
             continue
-        # Within the ball nobody knows which side of a long geom will touch.
-        if apart < arm.radii[geom] or counts[link] == DIRECTIONS:
-            counts[link] = EVERYWHERE
-            return
-        direction = directions[link, counts[link]]
-        for axis in range(3):
-            direction[axis] = way[axis] / apart
-        direction[3] = arm.reaches[geom]
-        counts[link] += 1
+        if box_distance(arm, geom, other) > NEAR + arm.radii[geom]:
+            continue
+        gap = _distance(arm.model, arm.data, geom, other, NEAR, ends.ctypes.data)
+        if gap < NEAR:
+            keep(ahead, a, link, ends, gap)
 
 
 @inner
-def write_way(arm: Any, geom: int, obstacle: int, way: Floats) -> float:
-    """Write the way (3,) from the centre of a geom to the box of an obstacle; return its length [m], 0 within it."""
-    for axis in range(3):
-        way[axis] = 0.0
-    frame = arm.frames[obstacle]
+def box_distance(arm: Any, geom: int, obstacle: int) -> float:
+    """Return how far the centre of a geom is from the box of an obstacle [m]."""
     square = 0.0
     for axis in range(3):
         along = -arm.boxes[obstacle, axis]
         for k in range(3):
             apart = arm.places[geom, k] - arm.places[obstacle, k]
-            along += frame[3 * k + axis] * apart
-        half = arm.boxes[obstacle, 3 + axis]
-        back = min(max(along, -half), half) - along
-        square += back * back
-        for k in range(3):
-            way[k] += frame[3 * k + axis] * back
+            along += arm.frames[obstacle, 3 * k + axis] * apart
+        beyond = max(0.0, abs(along) - arm.boxes[obstacle, 3 + axis])
+        square += beyond * beyond
     return np.sqrt(square)
+
+
+@inner
+def keep(ahead: Ahead, a: int, link: int, ends: Floats, gap: float) -> None:
+    """Keep a point of a link of arm ``a``; where there are too many, in the place of the farthest."""
+    points = ahead.points[a, link]
+    kept = ahead.counts[a, link]
+    if kept < NEAR_POINTS:
+        ahead.counts[a, link] += 1
+    else:
+        kept = 0
+        for k in range(1, NEAR_POINTS):
+            if points[k].gap > points[kept].gap:
+                kept = k
+        if points[kept].gap <= gap:
+            return
+
+    point = points[kept]
+    point.gap = gap
+    for axis in range(3):
+        point.place[axis] = ends[0, axis]
+        point.way[axis] = ends[1, axis] - ends[0, axis]
+    distance = length(point.way)
+    if gap < 0.0:
+        distance = -distance  # the nearest points of geoms that overlap lie the other way
+    for axis in range(3):
+        if distance != 0.0:
+            point.way[axis] /= distance

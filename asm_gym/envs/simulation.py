@@ -173,7 +173,7 @@ class Simulation:
 
     @property
     def ahead(self) -> Ahead:
-        """In which directions the arms are near obstacles; changed in place."""
+        """Where the arms are near obstacles; changed in place."""
         return self._limits.ahead
 
     @property

@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.envs.arm_brake import (
-    approaches,
+    how_soon,
     is_beside_base,
     share_at,
     stopping_impulse,
     twist_speed,
 )
-from asm_gym.envs.controllers import length
+from asm_gym.envs.controllers import velocity_at
 from asm_gym.envs.mujoco_views import (
+    EVERYWHERE,
     JOINT_ANGLES,
     UNKNOWN_CHANGE,
     Ahead,
@@ -56,6 +57,7 @@ class Motion(NamedTuple):
 
     jacobian: Floats  # (6, nv) of the hand: linear, then angular velocity
     twist: Floats  # (6,) of the hand [m/s], [rad/s]
+    turning_first: Floats  # (6,) the same, angular before linear
     solved: Floats  # (3, nv) M⁻¹ Jᵀ of the linear velocity
     inverse_mass: Floats  # (3, 3) Λ⁻¹ [1/kg]
     factor: Floats  # (3, 3) of it
@@ -70,7 +72,7 @@ class SpeedLimiter:
         arms: its arms, and what their inputs are.
         rest: (A,) the action that changes nothing.
         brake_speeds: (arms,) written with each call: the speed from which on an arm is braked [m/s].
-        ahead: in which directions the arms are near obstacles.
+        ahead: where the arms are near obstacles.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class SpeedLimiter:
         self._motion = Motion(
             jacobian=np.zeros((6, joints)),
             twist=np.zeros(6),
+            turning_first=np.zeros(6),
             solved=np.zeros((3, joints)),
             inverse_mass=np.zeros((3, 3)),
             factor=np.zeros((3, 3)),
@@ -151,11 +154,19 @@ def read_asked(
 
 
 @partial(inner, inlined=True)
-def asks_nearer(ahead: Ahead, a: int, twist: Floats) -> bool:
-    """Whether the twist (6,) that is asked of arm ``a``'s hand leads it to an obstacle."""
-    turning = length(twist[3:])
-    x, y, z = twist[0], twist[1], twist[2]
-    return approaches(ahead.counts[a, 0], ahead.directions[a, 0], x, y, z, turning)
+def asks_soon(views: Views, arm: Arm, ahead: Ahead, a: int, motion: Motion) -> float:
+    """Return how soon arm ``a``'s hand touches an obstacle in the motion that is asked of it; see ``how_soon``."""
+    if ahead.counts[a, 0] == EVERYWHERE:
+        return 1.0
+    for axis in range(3):
+        motion.turning_first[axis] = motion.twist[3 + axis]
+        motion.turning_first[3 + axis] = motion.twist[axis]
+    most = 0.0
+    for k in range(ahead.counts[a, 0]):
+        point = ahead.points[a, 0, k]
+        x, y, z = velocity_at(motion.turning_first, point.place, views.site_xpos[arm.site])
+        most = max(most, how_soon(point, x, y, z))
+    return most
 
 
 @partial(inner, inlined=True)
@@ -204,10 +215,11 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         angular = motion.jacobian[3:].ctypes.data
         _site_jacobian(views.model, views.data, linear, angular, arm.site)
         read_asked(views, arm, rest, action, motion)
+        soon = asks_soon(views, arm, ahead, a, motion)
         momentum = 0.0
-        if limit.momentum < np.inf and asks_nearer(ahead, a, motion.twist):
-            momentum = asked_momentum(views, motion)
-        share = share_at(views, arm, a, limit, motion.twist, momentum)
+        if soon > 0.0 and limit.momentum < np.inf:
+            momentum = soon * asked_momentum(views, motion)
+        share = share_at(views, arm, a, limit, motion.twist, soon, momentum)
         brake_speeds[a] = max(limit.hand_speed, share * twist_speed(motion.twist))
         if share < 1.0:
             scale_part(arm, np.float32(share), rest, slowed)
