@@ -48,7 +48,7 @@ def test_a_hand_that_rams_the_table_is_stopped_by_default(lift):
     assert said[-1]["asm"]["gave_up"]
     assert any(i["asm"]["reason"] == "contact" for i in said)
     speeds = [i["asm"]["severity"]["speed"] for i in said]
-    assert max(speeds) < 0.19
+    assert max(speeds) < 2.2 * ContactLimits().hand_speed
     assert np.isnan(lift.unwrapped.measured).sum() == 0
 
 
@@ -63,10 +63,11 @@ def test_a_held_cube_that_is_slammed_on_the_table_and_pressed_is_an_alarm_and_he
         up, state = expert.predict(observation, state, np.array([state is None]))
         observation, *_ = env.step(up)
     said = []
-    while not (said and said[-1]["asm"]["intervened"]):
+    reason = ""
+    while not (reason == "contact" and said[-1]["asm"]["intervened"]):
         said.append(env.step(action)[4])
+        reason = said[-1]["asm"]["reason"]
     felt = [i["asm"]["severity"]["force"] for i in said]
-    assert said[-2]["asm"]["reason"] == "contact"
     assert sum(force > 40.0 for force in felt) * 0.05 < 0.4
     assert max(i["contact_force"] for i in said) < 120.0
 
@@ -274,17 +275,24 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
         np.array([0.1, 0.2, 0.91]),
     )
 
-    def most(*twist, place=here, momentum=0.0):
+    def most(*twist, place=here, soon=1.0, momentum=0.0):
         speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
-        return limits.share(0, place, np.array(twist, float), speed, momentum)
+        return limits.share(0, place, np.array(twist, float), speed, soon, momentum)
 
     assert most(0.4, 0, 0, 0, 0, 1.0) >= 1.0  # as healthy hands did
     assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
     assert most(0.4, 0, 0, 0, 0, 0, place=here + 0.3) == pytest.approx(0.15 / 0.4)  # another place
     assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
-    # with whatever is behind it
+    # where nothing is near, up to twice the usual speed
+    for soon, speed in ((0.8, 0.15 / 0.8), (0.1, 0.3), (0.0, 0.3)):
+        free = most(0, 0, -0.6, 0, 0, 0, place=here - 0.1, soon=soon)
+        assert free == pytest.approx(speed / 0.6)
+    # what is behind it counts; in a task that is known it does not
+    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) < 0.1
+    known = HandSpeedMap.of({"Lift": HandSpeedMap.learned([stream], spec)}, "Lift")
+    limits = ContactLimits(pace=known)
     assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(0.15 / 0.3)
-    # not so where no healthy hand went down
+    # but where no healthy hand went down
     assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2
     assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == 0.5
     assert HandSpeedMap.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None

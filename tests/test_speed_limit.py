@@ -27,7 +27,7 @@ def share_of(limits, arm, place, twist, momentum, upright=1.0):
     healthy = 1.25 * np.where(twist > 0.0, along, against) + SLACK
     known = (healthy / np.maximum(np.abs(twist), STILL)).min()
     down = min(max(1.05 * against[2], 0.03), limits.hand_speed)
-    known = min(known, down / max(-twist[2], STILL))
+    known = min(known, down / max(-twist[2], STILL), own.pace_momentum / max(momentum, STILL))
     return max(usual, known)
 
 

@@ -22,6 +22,8 @@ from asm_gym.envs.mujoco_views import NEAR_POINTS, Ahead, Arm, Arms, Floats, Int
 # Beyond it nothing is touched within a control step of 50 ms at 1 m/s [m].
 NEAR = 0.06
 
+WORLD = 0  # the body that all others stand on
+
 link_library()
 _distance: Any = types.ExternalFunction(
     "mj_geomDistance",
@@ -169,7 +171,8 @@ def note_geom(
         if body >= 0 and is_carried[body]:
             continue
         # A link turns on the one that carries it, and never meets it.
-        if arm.parents[arm.bodies[geom]] == arm.bodies[other]:
+        carrier = arm.parents[arm.bodies[geom]]
+        if carrier == arm.bodies[other] and carrier != WORLD:
             continue
         if box_distance(arm, geom, other) > NEAR + arm.radii[geom]:
             continue
