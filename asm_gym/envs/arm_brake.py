@@ -10,7 +10,7 @@ where the momentum p is the largest of the impulses |Λ v| that stop a point of 
 hard and does not slide, be it a forearm on the robot's own pedestal. At a distance g, approached with the speed c, it
 counts
 
-    min(1, T c / g)                       T: a control step, and what it takes to brake
+    min(1, T c / g)                       T: what it takes to brake
 
 since a point that would not touch within T can still be braked. Beyond its share the motors slow the arm down,
 
@@ -50,8 +50,11 @@ from asm_gym.envs.mujoco_views import (
     Work,
 )
 
-SOON_S = 0.065  # T
-LEAST_GAP = 1e-3  # [m]
+SOON_S = 0.03  # T
+SURE_GAP = (
+    2e-3  # curved surfaces come so much nearer in a control step than their nearest points did [m]
+)
+LEAST_GAP = 1e-3  # no distance is divided by less [m]
 SLIDES = 0.01  # a point that comes nearer by less slides along [m/s]
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
@@ -127,24 +130,42 @@ def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[
             hardest = max(hardest, point_momentum(views, arm, n, place, work))
         for k in range(ahead.counts[a, n]):
             point = ahead.points[a, n, k]
+            gap = present_gap(views, arm.links[n], point, work.place)
             origin = views.subtree_com[arm.root]
-            x, y, z = velocity_at(views.cvel[arm.links[n]], point.place, origin)
-            soon = how_soon(point, x, y, z)
+            x, y, z = velocity_at(views.cvel[arm.links[n]], work.place, origin)
+            soon = how_soon(point.way, gap, x, y, z)
             if soon > 0.0:
-                momentum = point_momentum(views, arm, n, point.place, work)
+                momentum = point_momentum(views, arm, n, work.place, work)
                 soonest = max(soonest, soon)
                 hardest = max(hardest, soon * momentum)
         n += 1
     return soonest, hardest
 
 
+@partial(inner, inlined=True)
+def present_gap(views: Views, link: int, point: Any, place: Floats) -> float:
+    """Write where a point of a link is now into ``place`` (3,); return how far it is from what does not move [m]."""
+    gap = point.gap
+    for axis in range(3):
+        place[axis] = views.xpos[link, axis]
+        for k in range(3):
+            place[axis] += views.xmat[link, 3 * axis + k] * point.in_link[k]
+        gap -= point.way[axis] * (place[axis] - point.place[axis])
+    return gap
+
+
 @inner
-def how_soon(point: Any, x: float, y: float, z: float) -> float:
-    """Return how soon a point near an obstacle touches it that moves so fast [m/s]: 1 for within T, 0 for never."""
-    closing = point.way[0] * x + point.way[1] * y + point.way[2] * z
+def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
+    """Return how soon a point touches an obstacle that moves so fast [m/s]: 1 for within T, 0 for never.
+
+    Args:
+        way: (3,) to the obstacle, a unit vector.
+        gap: how far it is [m].
+    """
+    closing = way[0] * x + way[1] * y + way[2] * z
     if closing < SLIDES:
         return 0.0
-    return min(1.0, SOON_S * closing / max(point.gap, LEAST_GAP))
+    return min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
 
 
 @partial(inner, inlined=True)

@@ -55,6 +55,7 @@ class Views(NamedTuple):
     cvel: Floats  # (nbody, 6)
     subtree_com: Floats  # (nbody, 3)
     xpos: Floats  # (nbody, 3)
+    xmat: Floats  # (nbody, 9)
     site_xpos: Floats  # (nsite, 3)
     site_xmat: Floats  # (nsite, 9)
     sensordata: Floats
@@ -160,7 +161,8 @@ class Work(NamedTuple):
     products: Floats  # (JOINTS, JOINTS) J M⁻¹ Jᵀ, and below it J M⁻¹ p
     rotations: Floats  # (3, 3, 3) frames on the way to a set-point
     twist: Floats  # (6,) of the hand [m/s], [rad/s]
-    momentum: Floats  # (3,) of a link [N s]
+    place: Floats  # (3,) of a point of a link [m]
+    momentum: Floats  # (3,) of it [N s]
     inverse_mass: Floats  # (3, 3) a factor of that of a link [1/kg]
 
     @classmethod
@@ -183,6 +185,7 @@ class Work(NamedTuple):
             products=np.zeros(square),
             rotations=np.zeros((3, 3, 3)),
             twist=np.zeros(6),
+            place=np.zeros(3),
             momentum=np.zeros(3),
             inverse_mass=np.zeros((3, 3)),
         )
@@ -205,12 +208,13 @@ MotionLimits = tuple[SpeedLimit, SpeedLimit]  # of hands, and of those beside th
 
 NEAR_POINT = np.dtype(
     [
-        ("place", np.float64, 3),  # of the link, where it is nearest to something [m]
+        ("place", np.float64, 3),  # of the link, where it was nearest to something [m]
+        ("in_link", np.float64, 3),  # the same in the link's frame
         ("way", np.float64, 3),  # from there to the obstacle, a unit vector
-        ("gap", np.float64),  # how far it is [m]
+        ("gap", np.float64),  # how far it was [m]
     ]
 )
-"""Where a link is near an obstacle."""
+"""Where a link is near an obstacle, as a control step began."""
 
 
 class Ahead(NamedTuple):

@@ -1,8 +1,8 @@
 """Where an arm might meet something: only towards it is the arm's momentum limited.
 
 Around each geom of the arm there is a ball, and around each geom of anything else a box. Of pairs whose ball and box
-are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the speed of the arm's
-point towards the other's tells how soon they would touch. What the hand touches and can be carried belongs to the hand:
+are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the place and the speed of the
+arm's point tell how soon they would touch (``arm_brake``). What the hand touches and can be carried belongs to the hand:
 it is no obstacle, and meets others.
 """
 
@@ -36,6 +36,7 @@ class ArmGeoms(NamedTuple):
 
     model: int  # its address
     data: int  # its address
+    link_bodies: Ints  # (MOST_BODIES,) the links, from the hand on; then -1
     links: Ints  # (ngeom,) index of the link that carries each geom, from the hand on; else -1
     own: Ints  # (G,) geoms of the arm
     others: Ints  # (O,) other geoms
@@ -46,6 +47,8 @@ class ArmGeoms(NamedTuple):
     boxes: Floats  # (ngeom, 6) centre and half edges of the box around each, in its frame [m]
     places: Floats  # (ngeom, 3)
     frames: Floats  # (ngeom, 9)
+    body_places: Floats  # (nbody, 3)
+    body_frames: Floats  # (nbody, 9)
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData, arms: Arms, a: int) -> ArmGeoms:
@@ -57,6 +60,7 @@ class ArmGeoms(NamedTuple):
         return cls(
             model=model._address,
             data=data._address,
+            link_bodies=arms[a].links,
             links=link_of_geom,
             own=np.flatnonzero(collides & (link_of_geom >= 0)),
             others=np.flatnonzero(collides & (link_of_geom < 0)),
@@ -67,6 +71,8 @@ class ArmGeoms(NamedTuple):
             boxes=model.geom_aabb,
             places=data.geom_xpos,
             frames=data.geom_xmat,
+            body_places=data.xpos,
+            body_frames=data.xmat,
         )
 
 
@@ -178,7 +184,9 @@ def note_geom(
             continue
         gap = _distance(arm.model, arm.data, geom, other, NEAR, ends.ctypes.data)
         if gap < NEAR:
-            keep(ahead, a, link, ends, gap)
+            point = point_to_keep(ahead, a, link, gap)
+            if point >= 0:
+                write_point(arm, arm.link_bodies[link], ends, gap, ahead.points[a, link, point])
 
 
 @inner
@@ -196,21 +204,25 @@ def box_distance(arm: Any, geom: int, obstacle: int) -> float:
 
 
 @inner
-def keep(ahead: Ahead, a: int, link: int, ends: Floats, gap: float) -> None:
-    """Keep a point of a link of arm ``a``; where there are too many, in the place of the farthest."""
-    points = ahead.points[a, link]
+def point_to_keep(ahead: Ahead, a: int, link: int, gap: float) -> int:
+    """Return which of the points of a link of arm ``a`` gives way to one so near; -1 where all are nearer."""
     kept = ahead.counts[a, link]
     if kept < NEAR_POINTS:
         ahead.counts[a, link] += 1
-    else:
-        kept = 0
-        for k in range(1, NEAR_POINTS):
-            if points[k].gap > points[kept].gap:
-                kept = k
-        if points[kept].gap <= gap:
-            return
+        return kept
+    points = ahead.points[a, link]
+    farthest = 0
+    for k in range(1, NEAR_POINTS):
+        if points[k].gap > points[farthest].gap:
+            farthest = k
+    if points[farthest].gap <= gap:
+        return -1
+    return farthest
 
-    point = points[kept]
+
+@inner
+def write_point(arm: Any, body: int, ends: Floats, gap: float, point: Any) -> None:
+    """Write the point of a link, a body, that has the nearest points ``ends`` (2, 3) with another geom."""
     point.gap = gap
     for axis in range(3):
         point.place[axis] = ends[0, axis]
@@ -221,3 +233,7 @@ def keep(ahead: Ahead, a: int, link: int, ends: Floats, gap: float) -> None:
     for axis in range(3):
         if distance != 0.0:
             point.way[axis] /= distance
+        point.in_link[axis] = 0.0
+        for k in range(3):
+            from_link = point.place[k] - arm.body_places[body, k]
+            point.in_link[axis] += arm.body_frames[body, 3 * k + axis] * from_link

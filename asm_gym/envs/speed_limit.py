@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.envs.arm_brake import (
     how_soon,
+    present_gap,
     is_beside_base,
     share_at,
     stopping_impulse,
@@ -58,6 +59,7 @@ class Motion(NamedTuple):
     jacobian: Floats  # (6, nv) of the hand: linear, then angular velocity
     twist: Floats  # (6,) of the hand [m/s], [rad/s]
     turning_first: Floats  # (6,) the same, angular before linear
+    place: Floats  # (3,) of a point of the hand [m]
     solved: Floats  # (3, nv) M⁻¹ Jᵀ of the linear velocity
     inverse_mass: Floats  # (3, 3) Λ⁻¹ [1/kg]
     factor: Floats  # (3, 3) of it
@@ -88,6 +90,7 @@ class SpeedLimiter:
             jacobian=np.zeros((6, joints)),
             twist=np.zeros(6),
             turning_first=np.zeros(6),
+            place=np.zeros(3),
             solved=np.zeros((3, joints)),
             inverse_mass=np.zeros((3, 3)),
             factor=np.zeros((3, 3)),
@@ -164,8 +167,9 @@ def asks_soon(views: Views, arm: Arm, ahead: Ahead, a: int, motion: Motion) -> f
     most = 0.0
     for k in range(ahead.counts[a, 0]):
         point = ahead.points[a, 0, k]
-        x, y, z = velocity_at(motion.turning_first, point.place, views.site_xpos[arm.site])
-        most = max(most, how_soon(point, x, y, z))
+        gap = present_gap(views, arm.links[0], point, motion.place)
+        x, y, z = velocity_at(motion.turning_first, motion.place, views.site_xpos[arm.site])
+        most = max(most, how_soon(point.way, gap, x, y, z))
     return most
 
 
