@@ -1,9 +1,9 @@
 """Where an arm might meet something: only towards it is the arm's momentum limited.
 
 Around each geom of the arm there is a ball, and around each geom of anything else a box. Of pairs whose ball and box
-are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the place and the speed of the
-arm's point tell how soon they would touch (``arm_brake``). What the hand touches and can be carried belongs to the hand:
-it is no obstacle, and meets others.
+are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the place and the speed
+of the arm's point tell how soon they would touch (``arm_brake``). What the hand touches and can be carried belongs to
+the hand: it is no obstacle, and meets others.
 """
 
 from __future__ import annotations

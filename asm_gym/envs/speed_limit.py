@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.envs.arm_brake import (
     how_soon,
-    present_gap,
     is_beside_base,
+    present_gap,
     share_at,
     stopping_impulse,
     twist_speed,
