@@ -10,9 +10,9 @@ where the momentum p is the largest of the impulses |Λ v| that stop a point of 
 hard and does not slide, be it a forearm on the robot's own pedestal. At a distance g, approached with the speed c, it
 counts
 
-    min(1, T c / g)                       T: what it takes to brake
+    min(1, T c / g) min(1, √2 c / |v|)    T: what it takes to brake
 
-since a point that would not touch within T can still be braked. Beyond its share the motors slow the arm down,
+since a point that would not touch within T can still be braked, and one that grazes slides. Beyond its share the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -55,7 +55,9 @@ SURE_GAP = (
     2e-3  # curved surfaces come so much nearer in a control step than their nearest points did [m]
 )
 LEAST_GAP = 1e-3  # no distance is divided by less [m]
-SLIDES = 0.01  # a point that comes nearer by less slides along [m/s]
+STICKS = np.sqrt(
+    2.0
+)  # at a friction of 1, what comes at 45 degrees or more squarely does not slide
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
 ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
@@ -156,16 +158,18 @@ def present_gap(views: Views, link: int, point: Any, place: Floats) -> float:
 
 @inner
 def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
-    """Return how soon a point touches an obstacle that moves so fast [m/s]: 1 for within T, 0 for never.
+    """Return how soon and squarely a point touches an obstacle that moves so fast [m/s]: 1 for within T, 0 for never.
 
     Args:
         way: (3,) to the obstacle, a unit vector.
         gap: how far it is [m].
     """
     closing = way[0] * x + way[1] * y + way[2] * z
-    if closing < SLIDES:
+    if closing <= 0.0:
         return 0.0
-    return min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
+    speed = np.sqrt(x * x + y * y + z * z)
+    squarely = min(1.0, STICKS * closing / speed)
+    return squarely * min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
 
 
 @partial(inner, inlined=True)
