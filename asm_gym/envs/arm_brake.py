@@ -10,9 +10,10 @@ where the momentum p is the largest of the impulses |Λ v| that stop a point of 
 hard and does not slide, be it a forearm on the robot's own pedestal. At a distance g, approached with the speed c, it
 counts
 
-    min(1, T c / g) min(1, √2 c / |v|)    T: what it takes to brake
+    min(1, T c / g) min(1, 2 c / |v|)     T: what it takes to brake
 
-since a point that would not touch within T can still be braked, and one that grazes slides. Beyond its share the motors slow the arm down,
+since a point that would not touch within T can still be braked, and one that grazes slides. Beyond its share the motors
+slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -55,9 +56,7 @@ SURE_GAP = (
     2e-3  # curved surfaces come so much nearer in a control step than their nearest points did [m]
 )
 LEAST_GAP = 1e-3  # no distance is divided by less [m]
-STICKS = np.sqrt(
-    2.0
-)  # at a friction of 1, what comes at 45 degrees or more squarely does not slide
+SQUARELY = 2.0  # what comes at 30 degrees or more to a surface counts in full
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
 ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
@@ -168,7 +167,7 @@ def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
     if closing <= 0.0:
         return 0.0
     speed = np.sqrt(x * x + y * y + z * z)
-    squarely = min(1.0, STICKS * closing / speed)
+    squarely = min(1.0, SQUARELY * closing / speed)
     return squarely * min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
 
 
