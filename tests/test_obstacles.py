@@ -103,6 +103,9 @@ def test_an_arm_is_slowed_down_on_its_way_to_the_table_and_not_away_from_it(lift
     lift.reset(seed=0)
     arm = lift.unwrapped
     arm.contact_limits = limits
+    aside = np.float32([0, 1, 0, 0, 0, 0, 0])  # from above the cube
+    for _ in range(15):
+        lift.step(aside)
     down = np.float32([0, 0, -1, 0, 0, 0, 0])
     braked = []
     for _ in range(60):

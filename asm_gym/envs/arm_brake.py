@@ -52,9 +52,7 @@ from asm_gym.envs.mujoco_views import (
 )
 
 SOON_S = 0.03  # T
-SURE_GAP = (
-    2e-3  # curved surfaces come so much nearer in a control step than their nearest points did [m]
-)
+SURE_GAP = 2e-3  # curved surfaces may be nearer by so much than their nearest points were [m]
 LEAST_GAP = 1e-3  # no distance is divided by less [m]
 SQUARELY = 2.0  # what comes at 30 degrees or more to a surface counts in full
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
