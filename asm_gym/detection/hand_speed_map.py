@@ -44,8 +44,6 @@ TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
 TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
 LEAST_UPRIGHT = 0.9  # other hands point down to within 26 degrees
 
-NOTHING_EARNED = np.zeros((0, FASTEST_COLUMNS.stop), np.float32)
-
 
 class HandSpeedMap:
     """How fast healthy hands went, by place and direction.
@@ -54,7 +52,6 @@ class HandSpeedMap:
         cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of the momentum of an arm's hand and links, where no healthy hand was [N s].
         pace_momentum: the same where one was; infinite in a task that is known.
-        earned: (N, 16) speeds that hands have earned under a guard (``guard.earned_speed``).
 
     Raises:
         ValueError: cells of another shape, places that are too far away, or negative speeds.
@@ -70,9 +67,8 @@ class HandSpeedMap:
         cells: AnyFloats,
         momentum: float = MOMENTUM,
         pace_momentum: float = MOMENTUM,
-        earned: AnyFloats = NOTHING_EARNED,
     ) -> None:
-        if not _are_cells(cells) or (len(earned) and not _are_cells(earned)):
+        if not _are_cells(cells):
             raise ValueError(
                 f"pace must be rows of {FASTEST_COLUMNS.stop} numbers, "
                 f"places within {FARTHEST_CELL} cells, got {cells.shape}"
@@ -80,16 +76,14 @@ class HandSpeedMap:
         self.cells = cells
         self.momentum = momentum
         self.pace_momentum = pace_momentum
-        self.earned = earned
 
-        all_cells = np.concatenate((cells, earned))
-        places = all_cells[:, ARM_AND_PLACE].astype(np.int64)
+        places = cells[:, ARM_AND_PLACE].astype(np.int64)
         self.low = places.min(axis=0) - (0, 1, 1, 1)
         offsets = places - self.low
         shape = np.add(offsets.max(axis=0), (1, 2, 2, 2))
         grid = np.zeros((*shape, 2 * AXES), np.float32)
         at = tuple(offsets.T)
-        np.maximum.at(grid, at, all_cells[:, FASTEST_COLUMNS])
+        np.maximum.at(grid, at, cells[:, FASTEST_COLUMNS])
 
         tilting = cells[:, FASTEST_COLUMNS][:, TILTING].max(axis=1)
         self.least_upright = LEAST_UPRIGHT
@@ -113,10 +107,6 @@ class HandSpeedMap:
         if not cells_by_task:
             return None
         return cls(np.concatenate(list(cells_by_task.values())))
-
-    def with_earned(self, earned: AnyFloats) -> Self:
-        """Return the map with other speeds (N, 16) that hands have earned."""
-        return type(self)(self.cells, self.momentum, self.pace_momentum, earned)
 
     @classmethod
     def by_task(

@@ -55,13 +55,6 @@ class EpisodeLimits:
         self._steps_left[which] = 0
         self._choose()
 
-    def set_pace(self, which: Mask, pace: HandSpeedMap) -> None:
-        """Let the hands of the robots of ``which`` (n,) go as fast as a map allows from their next episodes on."""
-        for robot in np.flatnonzero(which).tolist():
-            usual = self._usual[robot]
-            if usual is not None and usual.pace is not pace:
-                self._usual[robot] = replace(usual, pace=pace)
-
     def follow(self, acted: Mask, pressed: Mask) -> None:
         """Take account of a step: in robots of ``acted`` (n,) the policy acted, and of ``pressed`` (n,) too hard."""
         fewer = np.maximum(self._steps_left - 1, 0)

@@ -29,7 +29,6 @@ from asm_gym.guard.chunk_preview import Preview, one_row_each, preview_chunk
 from asm_gym.guard.commander import Command, Commander, Observe
 from asm_gym.guard.contact_state import no_load
 from asm_gym.guard.diagnostician import Diagnostician
-from asm_gym.guard.earned_speed import earned_speed_of
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.fitted_monitor import STALE, FittedMonitor, diagnosis_of
 from asm_gym.guard.judged_rows import JudgedRow, RowJudge
@@ -127,7 +126,9 @@ class Guard:
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
         self._row_judge = self._new_row_judge(motion)
         self._commander = self._new_commander(motion, policies, monitor)
-        self._limit_speed(monitor, options)
+        limits = limits_of(options.contact_limits, monitor, facts)
+        acts = self._on_alarm != "monitor" and facts.rest.size > 0
+        self._limits = EpisodeLimits(facts, limits, acts)
 
         self._wear = WearWatch(monitor, facts.count)
         self.running = self._arbiter.running
@@ -137,17 +138,6 @@ class Guard:
         self._all_active = True  # the field ``active`` of every record is True
         # What failed when the newest command was chosen, by robot.
         self._command_failures: Mapping[int, str] = NOTHING
-
-    def _limit_speed(self, monitor: Monitor, options: GuardOptions) -> None:
-        """Take up the contact limits, and what hands may earn."""
-        limits = limits_of(options.contact_limits, monitor, self._facts)
-        acts = self._on_alarm != "monitor" and self._facts.rest.size > 0
-        self._limits = EpisodeLimits(self._facts, limits, acts)
-        self._earned = None
-        if options.earns_speed and acts and limits is not None:
-            self._earned = earned_speed_of(monitor, self._facts, limits)
-        if self._earned is not None:
-            self._limits.set_pace(self._everyone, self._earned.speed_map)
 
     def _new_row_judge(self, motion: FeltMotion | None) -> RowJudge:
         """Return what judges rows in one compiled call."""
@@ -236,21 +226,6 @@ class Guard:
         """Write the memory with the level shifts of a robot that were acknowledged, in a note."""
         self._acknowledgements.save(path, robot)
 
-    def keep_earned_speed(self) -> None:
-        """Keep in the memory what hands have earned in this task; the next guard of it begins with that.
-
-        Raises:
-            ValueError: nothing can be earned here.
-        """
-        if self._earned is None:
-            task = self._facts.task or "this environment"
-            raise ValueError(
-                f"no speed is earned in {task}: the memory knows its pace, or the guard limits no "
-                "speed, or earns_speed is False"
-            )
-        memory: Any = self.fitted.monitor
-        memory.earned_ = memory.earned_ | {self._facts.task: self._earned.cells}
-
     def acknowledge_wear(self) -> None:
         """Forget all wear: the next blocks of operation say what is healthy."""
         self._wear.acknowledge()
@@ -260,9 +235,6 @@ class Guard:
         if which is None:
             which = self._everyone
         self._arbiter.follow_thresholds(which)
-        if self._earned is not None:
-            self._earned.end_episodes(which)
-            self._limits.set_pace(which, self._earned.speed_map)
         for part in (
             self.table,
             self._arbiter,
@@ -372,8 +344,6 @@ class Guard:
             self._acknowledgements.note_alarms(self.table.records["over"], row.attribution)
             self._decide(row)
         self._wear.follow(row.rows, self.table.records)
-        if self._earned is not None:
-            self._earned.follow(row.rows, self.table.records)
         self._prepare_next_step(row)
         report = self._report(row)
         if row.eventful:

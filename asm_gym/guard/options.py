@@ -70,7 +70,6 @@ class GuardOptions:
     contact_limits: ContactLimits | str | None = "memory"
     adaptive_threshold: AdaptiveThreshold | None = None
     action_means: ActionMeans | None = None
-    earns_speed: bool = True
 
     def __post_init__(self) -> None:
         if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:
@@ -83,7 +82,6 @@ class GuardOptions:
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), low=1, whole=True)
         check_flag("truncate", self.truncate)
-        check_flag("earns_speed", self.earns_speed)
         responses_from(self.responses)
         limits = self.contact_limits
         if not (limits is None or isinstance(limits, ContactLimits) or limits == "memory"):

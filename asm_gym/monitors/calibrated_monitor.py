@@ -72,7 +72,6 @@ class CalibratedMonitor:
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty if the stream has no such channels.
         pace_: by task, (N, 16) speed of the hands in these episodes by place and direction; see ``HandSpeedMap``.
-        earned_: by task, (N, 16) speed that hands have earned under a guard (``guard.earned_speed``).
         motion_: how hands move by commands (``detection.commands``); None without hands.
         commands_: (3, A) least, most and greatest step of the commands of these episodes; None without.
         ranges_: (8, D) how far each number went in these episodes (``detection.healthy_ranges``); None in files of
@@ -86,7 +85,6 @@ class CalibratedMonitor:
     blocks_: Blocks | None
     healthy_: tuple[float, ...]
     pace_: dict[str, NDArray[np.float32]]
-    earned_: dict[str, NDArray[np.float32]]
     motion_: NDArray[np.floating[Any]] | None
     commands_: NDArray[np.floating[Any]] | None
     ranges_: NDArray[np.floating[Any]] | None
@@ -299,7 +297,6 @@ class CalibratedMonitor:
         streams = [episode.stream for episode in episodes]
         self.healthy_ = healthy_forces(streams, self.spec)
         self.pace_ = HandSpeedMap.by_task(episodes, self.spec)
-        self.earned_ = {}
         self.motion_ = learned_motion(streams, self.spec)
         self.commands_ = healthy_commands(streams, self.spec)
         self.wear_ = self._healthy_wear(streams)
@@ -438,7 +435,6 @@ class CalibratedMonitor:
         self.promised_ = EPISODE
         self.healthy_ = ()
         self.pace_ = {}
-        self.earned_ = {}
         self.motion_ = None
         self.commands_ = None
         self.ranges_ = None

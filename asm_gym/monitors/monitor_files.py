@@ -20,8 +20,7 @@ from asm_gym.validation import check_choice, check_number
 
 BLOCKS = "nominal_blocks"
 MAXIMA = "nominal_maxima"
-BY_TASK = {"pace_": "pace ", "earned_": "earned "}
-"""What begins the names of the arrays of each attribute that has one for each task."""
+PACE_PREFIX = "pace "  # begins the name of the array of a task
 
 OPTIONAL = {
     "learned_from_": "learned_from",
@@ -69,9 +68,8 @@ def read_monitor(saved: Checkpoint) -> SavedMonitor:
     }
     if BLOCKS in arrays:
         attributes["blocks_"] = Blocks.restored(arrays.pop(BLOCKS))
-    for attribute, prefix in BY_TASK.items():
-        tasks = [name for name in arrays if name.startswith(prefix)]
-        attributes[attribute] = {name.removeprefix(prefix): arrays.pop(name) for name in tasks}
+    tasks = [name for name in arrays if name.startswith(PACE_PREFIX)]
+    attributes["pace_"] = {name.removeprefix(PACE_PREFIX): arrays.pop(name) for name in tasks}
     for attribute, name in OPTIONAL.items():
         attributes[attribute] = arrays.pop(name, None)
     return SavedMonitor(arrays, attributes)
@@ -103,9 +101,8 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
     for attribute, name in OPTIONAL.items():
         if getattr(monitor, attribute) is not None:
             arrays[name] = getattr(monitor, attribute)
-    for attribute, prefix in BY_TASK.items():
-        for task, cells in getattr(monitor, attribute).items():
-            arrays[prefix + task] = cells
+    for task, cells in monitor.pace_.items():
+        arrays[PACE_PREFIX + task] = cells
 
     header = {
         "spec": monitor.spec.to_json(),

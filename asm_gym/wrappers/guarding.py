@@ -70,7 +70,6 @@ class Guarding:
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
         action_means: ActionMeans | None = None,
-        earns_speed: bool = True,
     ) -> None:
         self._options = GuardOptions(
             on_alarm=on_alarm,
@@ -82,7 +81,6 @@ class Guarding:
             responses=responses,
             contact_limits=contact_limits,
             action_means=action_means,
-            earns_speed=earns_speed,
         )
         self._limits: tuple[Any, ...] = ()
         self._wrap(env, monitor)
@@ -200,13 +198,6 @@ class Guarding:
     def acknowledge_wear(self) -> None:
         """Forget the wear in ``info["asm"]["wear"]``: the next episodes say what is healthy."""
         self.guard.acknowledge_wear()
-
-    def keep_earned_speed(self) -> None:
-        """Keep in the memory how fast hands may go in this task by now; ``monitor.save`` then saves it.
-
-        Raises ValueError where no speed is earned: in tasks whose pace the memory knows, or ``earns_speed=False``.
-        """
-        self.guard.keep_earned_speed()
 
     @property
     def latency(self) -> float:

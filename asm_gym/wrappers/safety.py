@@ -77,8 +77,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             ``"torque"``, or one for each number of an action. A target arm is held by its present position as target,
             others by zero. By default the attribute ``action_means`` of the environment, or else what the
             monitor found in its training episodes.
-        earns_speed: in a task whose pace the memory does not know, a hand may go faster where it has passed freely
-            before, from episode to episode (``asm_gym.guard.earned_speed``). ``keep_earned_speed`` keeps that.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response; a response that lets a pressing arm go on; a reflex

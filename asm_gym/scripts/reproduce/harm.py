@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -34,17 +33,14 @@ from asm_gym.scripts.reproduce import harm_search, kit
 from asm_gym.scripts.reproduce.harm_cases import (
     CASE,
     CONTROL_RATE,
-    EARNED,
     ELSEWHERE,
     GUARDS,
     RAMMED_TASKS,
     Case,
-    earn,
     guarded,
 )
 from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.tasks import env_id
-from asm_gym.validation import check_number
 
 MET_TASKS = (*RAMMED_TASKS, "PickPlaceBread", "PickPlaceCereal")
 """Tasks that the Panda's memory knows."""
@@ -77,7 +73,6 @@ IMPAIRED_TASKS = ("Lift", "PickPlaceCan")
 RAMMING = ("down", "aside and down", "forward", "ramp")
 """Hostile policies that act with an impairment."""
 AGAINST = ("hostile", "elsewhere", "impaired", "faulty", "unmet")
-check_episodes = partial(check_number, "earned", low=1, whole=True)
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 LITTLE = 1.0  # a cell with no more harm without a guard does not count [N s]
 
@@ -97,9 +92,6 @@ class Config(kit.Config):
     search: int = option(0, least=0)
     """Episodes of a search for the hardest contact, under each guard, with each arm in each task; nothing else is done.
     """
-    earned: tuple[int, ...] = option((), check=check_episodes, metavar="EPISODES")
-    """Also guards that have earned speed for so many episodes of the task's expert, in tasks that the memory has not
-    met."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option(
@@ -195,12 +187,9 @@ def jobs_of(config: Config) -> list[tuple[Case, str]]:
     """Return every episode: a case with its seed, and a guard."""
     jobs = []
     for repetition, (case, count) in product(config.repetitions, cases(config)):
-        guards = [*config.guards]
-        if case.trial.task in UNMET_TASKS:
-            guards += [f"{EARNED}{episodes}" for episodes in config.earned]
-        for number, guard in product(range(count), guards):
+        for number, guard in product(range(count), config.guards):
             trial = replace(case.trial, seed=10_000 * repetition + 1000 + number)
-            jobs.append((case._replace(trial=trial, folder=str(config.out)), guard))
+            jobs.append((case._replace(trial=trial), guard))
     return jobs
 
 
@@ -209,10 +198,6 @@ def run(config: Config) -> kit.Findings:
     if config.search:
         tasks = [task for task in config.tasks if task in RAMMED_TASKS]
         return harm_search.run(tasks, config.guards, config.search, config)
-    if config.earned:
-        config.out.mkdir(parents=True, exist_ok=True)
-        lessons = [(str(config.out), task, config.earned) for task in unmet_tasks(config)]
-        kit.each("earning", earn, lessons, config)
     records = kit.resumed("episodes", episode, jobs_of(config), config)
     frame = pd.DataFrame(records)
     hostile = frame[frame.kind == "hostile"]
