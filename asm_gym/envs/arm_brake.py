@@ -10,10 +10,10 @@ where the momentum p is the largest of the impulses |Λ v| that stop a point of 
 hard and does not slide, be it a forearm on the robot's own pedestal. At a distance g, approached with the speed c, it
 counts
 
-    min(1, T c / g) min(1, 2 c / |v|)     T: what it takes to brake
+    min(1, T c / g)                       T: what it takes to brake
 
-since a point that would not touch within T can still be braked, and one that grazes slides. Beyond its share the motors
-slow the arm down,
+since a point that would not touch within T can still be braked. It counts in full also where it only grazes: MuJoCo's
+friction answers to all of its speed. Beyond its share the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -53,8 +53,8 @@ from asm_gym.envs.mujoco_views import (
 
 SOON_S = 0.03  # T
 SURE_GAP = 2e-3  # curved surfaces may be nearer by so much than their nearest points were [m]
-LEAST_GAP = 1e-3  # no distance is divided by less [m]
-SQUARELY = 2.0  # what comes at 30 degrees or more to a surface counts in full
+LEAST_GAP = 1e-4  # no distance is divided by less [m]
+SLIDES = 0.005  # a point that comes nearer by less slides along [m/s]
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
 ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
@@ -155,18 +155,16 @@ def present_gap(views: Views, link: int, point: Any, place: Floats) -> float:
 
 @inner
 def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
-    """Return how soon and squarely a point touches an obstacle that moves so fast [m/s]: 1 for within T, 0 for never.
+    """Return how soon a point touches an obstacle that moves so fast [m/s]: 1 for within T, 0 for never.
 
     Args:
         way: (3,) to the obstacle, a unit vector.
         gap: how far it is [m].
     """
     closing = way[0] * x + way[1] * y + way[2] * z
-    if closing <= 0.0:
+    if closing < SLIDES:
         return 0.0
-    speed = np.sqrt(x * x + y * y + z * z)
-    squarely = min(1.0, SQUARELY * closing / speed)
-    return squarely * min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
+    return min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
 
 
 @partial(inner, inlined=True)
