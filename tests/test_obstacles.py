@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.envs.arm_brake import SURE_GAP
 from asm_gym.envs.mujoco_views import ARM, records
 from asm_gym.envs.obstacles import NEAR, Obstacles
 
@@ -70,6 +71,32 @@ def test_points_are_the_nearest_of_all_that_is_near(world):
             assert point.gap == pytest.approx(gap)
             np.testing.assert_allclose([*point.place, *point.way], rest, atol=1e-9)
         seen += len(found)
+    assert seen > 100
+
+
+def test_a_point_moves_with_its_link_and_tells_the_gap_within_a_control_step(world):
+    model, data, _ = world
+    rng = np.random.default_rng(1)
+    geoms = [geom for geom in range(model.ngeom) if geom != model.geom("hand").id]
+    seen = 0
+    for _ in range(2000):
+        place = rng.uniform(LOW, HIGH)
+        points = points_at(world, place).copy()
+        moved = rng.uniform(-0.006, 0.006, 3)  # as far as 1 cm
+        data.mocap_pos[0] = place + moved
+        mujoco.mj_kinematics(model, data)
+        ends = np.zeros(6)
+        gaps = [
+            mujoco.mj_geomDistance(model, data, model.geom("hand").id, geom, 0.1, ends)
+            for geom in geoms
+        ]
+        for point in points:
+            np.testing.assert_allclose(data.xpos[-1] + point.in_link, point.place + moved)
+            told = point.gap - point.way @ moved
+            if told < 0.0:
+                continue
+            assert np.abs(told - gaps).min() < SURE_GAP
+            seen += 1
     assert seen > 100
 
 
