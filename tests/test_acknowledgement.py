@@ -120,6 +120,7 @@ def test_an_acknowledged_level_is_usual_from_then_on_and_another_cause_is_told(m
     events = watched(memory, stream, orders={420: "acknowledge"})
     assert "incident 1 is acknowledged: sum +0.5" in notes(events)
     assert [row > 2890 for row, _ in alarms(events)] == [False, True]
+    assert alarms(events)[1][1] == "q[0]"  # the level that was learned is no suspect
     learned = float(notes(events).split("sum +")[1].split()[0])
     assert learned == pytest.approx(SHIFT, abs=0.05)
 

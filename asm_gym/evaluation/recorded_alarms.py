@@ -6,12 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import SURPRISING, blamed, thresholds_shown
+from asm_gym.data.alarm_reasons import SURPRISING, thresholds_shown
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.episode import Episode
@@ -24,7 +25,7 @@ from asm_gym.evaluation.incident_window import AFTER_S, BEFORE_S, AlarmMoment, I
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import named_causes
-from asm_gym.monitors.blame import blamed_columns, reattribute_alarms
+from asm_gym.monitors.blame import REMEMBERED
 from asm_gym.monitors.expectation import (
     Expectation,
     Expected,
@@ -60,6 +61,7 @@ class Alarm(NamedTuple):
     beside: Expected | None = None  # the channel in its first row beside what was expected
     evidence: str = ""  # file of the rows around it
     cause: str = ""  # in words; empty where none was looked for
+    cause_name: str = ""  # one of ``named_causes.REMEDIES``, likewise
     remedy: str = ""  # what to do about it
     moment: AlarmMoment | None = None  # the channel around its first row
 
@@ -115,14 +117,6 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
     """
     assert trace.attribution is not None
     assert trace.stream is not None
-    begins = set(trace.alarms)
-
-    def blame_of(row: int) -> int | None:
-        """Return the column that blame points to, in the first row of surprise over its threshold."""
-        if row not in begins or trace.attribution is None or trace.stream is None:
-            return None
-        return blamed(trace.stream[row], trace.attribution[row])
-
     book = IncidentBook(trace.power)
     incidents = []  # they grow as long as rows follow
     for row in rows_of_alarm(
@@ -131,7 +125,7 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
         stream=trace.stream,
         threshold=trace.threshold,
         dt=trace.dt,
-        blame_of=blame_of,
+        blame_of=partial(blamed_in, trace),
     ):
         opened = book.follow(row)
         if opened is not None:
@@ -143,26 +137,38 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
             rows = trace.stream[max(alarm.row - 1, 0) : alarm.row + 1]
             alarm = alarm._replace(beside=expectation.at_end(rows, incident.column))
         if incident.reason == SURPRISING and trace.namer is not None:
-            cause = cause_of(trace, alarm.row, trace.namer)
+            cause = cause_of(trace, incident, trace.namer)
             in_words = cause.in_words(trace.channels, trace.units)
-            alarm = alarm._replace(cause=in_words, remedy=cause.remedy)
+            alarm = alarm._replace(cause=in_words, cause_name=cause.name, remedy=cause.remedy)
         alarms.append(alarm)
     return alarms
 
 
-def cause_of(trace: ScoredEpisode, first: int, namer: CauseNamer) -> NamedCause:
-    """Return the cause of the alarm that was raised in a row."""
-    assert trace.attribution is not None
-    assert trace.stream is not None
+def blamed_in(trace: ScoredEpisode, row: int) -> tuple[int, ...]:
+    """Return what blame points to in a row; empty where the monitor cannot blame."""
+    if trace.blame is None or trace.recentred is None:
+        return ()
+    rows = trace.recentred[max(0, row + 1 - REMEMBERED) : row + 1]
+    return trace.blame(rows, trace.raw_shares(row))
+
+
+def cause_of(trace: ScoredEpisode, incident: Incident, namer: CauseNamer) -> NamedCause:
+    """Return the cause of an incident."""
+    assert trace.recentred is not None
+    first = _first_row(trace, incident)
     start = max(0, first - round(named_causes.BEFORE_S / trace.dt))
     stop = first + round(named_causes.AFTER_S / trace.dt) + 1
-    columns = blamed_columns(trace.attribution[first])
-    return namer(trace.stream[start:stop], first - start, columns)
+    return namer(trace.recentred[start:stop], first - start, incident.blamed)
+
+
+def _first_row(trace: ScoredEpisode, incident: Incident) -> int:
+    """Return the index of the first row of an incident."""
+    return round(incident.start / trace.dt) - 1
 
 
 def _alarm(trace: ScoredEpisode, incident: Incident) -> Alarm:
     """Return an incident as an alarm of a recording."""
-    first = round(incident.start / trace.dt) - 1
+    first = _first_row(trace, incident)
     last = round(incident.last / trace.dt) - 1
     alarm = Alarm(
         log=trace.kind,
@@ -233,11 +239,12 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
     about = getattr(monitor, "about", {})
     names = LogSchema.kept_in(about, monitor.spec).names_in_logs
     shift = shift_of_columns(monitor.spec, shifts_kept_in(about))
-    surprises = monitor.score_episodes([recentred(log.episode, shift) for log in logs])
+    as_judged = [recentred(log.episode, shift) for log in logs]
+    surprises = monitor.score_episodes(as_judged)
     blame = getattr(monitor, "blame_", None)
     namer = getattr(monitor, "cause_namer_", None)
     traces = []
-    for (name, episode), surprise in zip(logs, surprises, strict=True):
+    for (name, episode), as_scored, surprise in zip(logs, as_judged, surprises, strict=True):
         fault = episode.faults
         if len(fault) != len(episode):
             fault = np.zeros(len(episode), np.bool_)
@@ -257,11 +264,11 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
             stream=episode.stream,
             origin=episode.info.get(LOG_ORIGIN),
             namer=namer,
+            blame=blame,
+            recentred=as_scored.stream,
             units=monitor.spec.units,
         )
-        before_blame = {row: judged.attribution[row].copy() for row in trace.alarms}
-        reattribute_alarms(blame, episode.stream, trace.alarms, judged.attribution)
-        traces.append(replace(trace, strong_shares=before_blame))
+        traces.append(trace)
     return traces
 
 
@@ -279,12 +286,10 @@ def followed(trace: ScoredEpisode, following: FollowingThreshold) -> ScoredEpiso
     factor = np.ones(len(trace))
     usual = np.isfinite(relative) & (trace.surprise > 0)
     np.divide(relative, trace.surprise, out=factor, where=usual)
-    strong_shares = {row: shares * factor[row] for row, shares in trace.strong_shares.items()}
     return replace(
         trace,
         surprise=relative,
         attribution=trace.attribution * factor[:, None],
-        strong_shares=strong_shares,
         top_channel="",
     )
 

@@ -57,11 +57,7 @@ SPEC = StreamSpec(
     source="table",
 )
 # A small memory learns such repeated work in a minute.
-SMALL: dict[str, Any] = {
-    "hidden_size": 64,
-    "association_size": 160,
-    "epochs": 10,
-}
+SMALL: dict[str, Any] = {"hidden_size": 64, "association_size": 160, "epochs": 10}
 FORCE = SPEC.slices["force"].start
 WIDTH = SPEC.slices["width"].start
 TORQUE = SPEC.slices["tau"].start
