@@ -39,6 +39,11 @@ HEADINGS = (
     *("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date"),
     *("sensed", "expected", "±", "unit", "rows around it", "cause", "what to do"),
 )
+TO_READ = (
+    *("from", "to", "log", "what happened", "what to do", "channel", "sensed", "expected"),
+    *("thresholds", "rows around it"),
+)
+"""Headings of the alarms in a report."""
 Floats = NDArray[np.float64]
 MOST_NAMED = 3  # channels that the table of an hour names
 
@@ -79,18 +84,43 @@ class Alarm(NamedTuple):
             return date_of(self.start)
         return ""
 
+    def shown(self, time: float) -> str:
+        """Return a time of the log for a reader: the date, where its clock has one, else seconds."""
+        date = ""
+        if self.has_stamps:
+            date = date_of(time)
+        if date:
+            return f"{date[:10]} {date[11:23]}"
+        return f"{time:.3f} s"
+
     def in_words(self) -> str:
-        """Return what happened, in a sentence or two."""
-        where = f"{self.log}, {self.start:.3f} s: "
-        text = f"{self.channel or 'the whole row'}: {self.why}"
-        if self.why == SURPRISING:
+        """Return what happened, in some sentences."""
+        if self.why != SURPRISING:
+            text = f"{self.channel or 'the whole row'}: {self.why}"
+        elif self.beside is None:
             text = f"{self.channel} is not what the other numbers let expect"
-            if self.beside is not None:
-                text = self.beside.sentence(self.channel)
+        else:
+            text = self.beside.sentence(self.channel)
+        if self.why == SURPRISING:
             text += f" ({thresholds_shown(self.excess)} thresholds)"
         if self.cause:
-            text += f". Cause: {self.cause}; {self.remedy}"
-        return f"{where}{text}."
+            to_do = f"{self.remedy[:1].upper()}{self.remedy[1:]}"
+            text = f"{self.cause}. {text}. {to_do}"
+        return f"{self.log}, {self.shown(self.start)}: {text}."
+
+    def line(self) -> tuple[str, ...]:
+        """Format for a report, under ``TO_READ``."""
+        sensed = ""
+        expected = ""
+        if self.beside is not None:
+            unit = self.beside.unit
+            sensed = f"{self.beside.sensed:.4g} {unit}"
+            expected = f"{self.beside.expected:.4g} ± {self.beside.plus_minus:.2g} {unit}"
+        return (
+            *(self.shown(self.start), self.shown(self.end), self.log),
+            *(self.cause or self.why, self.remedy, self.channel, sensed, expected),
+            *(thresholds_shown(self.excess), self.evidence),
+        )
 
     def cells(self, to_read: bool = False) -> tuple[str, ...]:
         """Format for a table, under ``HEADINGS``; ``to_read`` caps the surprise."""
@@ -210,22 +240,20 @@ def by_hour(alarms: Sequence[Alarm], hours: float) -> Table:
         alarms: of recordings.
         hours: duration of all recordings [h].
     """
-    counts: dict[tuple[str, int], Counter[str]] = {}
-    for alarm in alarms:
-        unit = "hour of the log"
-        hour = int(alarm.start // 3600)
+    counts: dict[str, Counter[str]] = {}
+    for alarm in sorted(alarms, key=lambda each: each.start):
+        hour = f"hour {int(alarm.start // 3600)} of the log"
         if alarm.date:
-            unit = "hour of the day (UTC)"
-            hour = datetime.fromtimestamp(alarm.start, UTC).hour
-        counts.setdefault((unit, hour), Counter())[alarm.channel or alarm.why] += 1
+            hour = f"{datetime.fromtimestamp(alarm.start, UTC).hour:02d}:00 UTC"
+        counts.setdefault(hour, Counter())[alarm.channel or alarm.why] += 1
     rows = []
-    for (unit, hour), channels in sorted(counts.items()):
-        names = ", ".join(f"{name} {count}" for name, count in channels.most_common(MOST_NAMED))
-        rows.append((f"{hour:02d}", unit, str(channels.total()), names))
+    for hour, channels in counts.items():
+        names = ", ".join(f"{count} {name}" for name, count in channels.most_common(MOST_NAMED))
+        rows.append((hour, str(channels.total()), names))
     caption = f"Alarms by hour: {len(alarms)} in {hours:.3g} hours"
     if hours > 0:
         caption += f", {len(alarms) / hours:.3g} an hour"
-    return Table(caption, ("from", "hour", "alarms", "channels"), rows)
+    return Table(caption, ("from", "alarms", "channels"), rows)
 
 
 def sensed_peak(trace: ScoredEpisode) -> float:

@@ -287,9 +287,11 @@ def record_of(event: Event, own: Sequence[Alarm]) -> dict[str, object]:
     """Return a line of the table: an event beside its incidents."""
     delay = ""
     named = ""
+    called = ""
     if own:
         delay = f"{own[0].start - event.start:.2f}"
         named = own[0].channel
+        called = own[0].cause
     return {
         "event": event.name,
         "from [h]": f"{event.start / 3600:.2f}",
@@ -298,4 +300,5 @@ def record_of(event: Event, own: Sequence[Alarm]) -> dict[str, object]:
         "first after [s]": delay,
         "names": named,
         "of": ", ".join(event.channels) or "the whole arm",
+        "called": called,
     }
