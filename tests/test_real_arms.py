@@ -18,7 +18,14 @@ from asm_gym.scripts.reproduce.added_faults import (
     with_fault,
 )
 from asm_gym.scripts.reproduce.arm_recordings import ARMS, SLIP_RAD
-from asm_gym.scripts.reproduce.real_arms import Job, examined, fault_result, monitor_row, split
+from asm_gym.scripts.reproduce.real_arms import (
+    Job,
+    examined,
+    fault_result,
+    monitor_row,
+    noise_table,
+    split,
+)
 from tests.streams import pendulum_columns
 
 INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
@@ -163,6 +170,22 @@ def test_runs_of_hiro_hold_one_row_in_four_of_angles_force_and_torque(tmp_path):
     np.testing.assert_allclose(good["position[2]"], t[::4, 0] + 2)
     np.testing.assert_allclose(good["torque[1]"], 10 * t[::4, 0] + 4)
     assert len(failed["force[0]"]) == 8  # of the shorter file
+
+
+def test_the_noise_of_runs_of_another_campaign_is_printed_beside_that_of_the_others(tmp_path):
+    rng = np.random.default_rng(0)
+    for group, noise in (("success", 0.01), ("error", 0.1)):
+        folder = tmp_path / ARMS["hiro"].place / group / "run-01"
+        folder.mkdir(parents=True)
+        t = np.arange(8000)[:, None] / 200
+        angles = np.sin(t * np.arange(1, 7) / 20)
+        np.savetxt(folder / "R_Angles.dat", np.hstack([t, angles]))
+        wrench = noise * rng.normal(size=(8000, 6))
+        np.savetxt(folder / "R_Torques.dat", np.hstack([t, wrench]))
+    table = noise_table(ARMS["hiro"], tmp_path)
+    force = table.headings.index("force")
+    assert float(table.rows[0][force]) == pytest.approx(0.01, rel=0.3)
+    assert float(table.rows[1][force]) == pytest.approx(0.1, rel=0.3)
 
 
 def test_pieces_are_dealt_out_once_and_no_more_is_learned_than_asked_for(folder):

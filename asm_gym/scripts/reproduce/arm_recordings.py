@@ -65,6 +65,7 @@ class RealArm:
     )  # channels of torques, or of force and torque at the wrist
     slip: float = SLIP_RAD  # of an encoder, in units of its position
     has_joint_torques: bool = True
+    one_campaign: bool = True  # its runs with faults were recorded as the healthy ones were
 
     def episodes(self, folder: Path) -> tuple[list[Episode], dict[str, list[Episode]]]:
         """Return the healthy runs as episodes, and those with faults by their kind."""
@@ -256,6 +257,7 @@ ARMS = {
         rate=50.0,
         efforts=("force", "torque"),
         has_joint_torques=False,
+        one_campaign=False,
     ),
     "hiro_repeated": RealArm(
         robot="Kawada HIRO, one programme",
@@ -266,6 +268,7 @@ ARMS = {
         rate=50.0,
         efforts=("force", "torque"),
         has_joint_torques=False,
+        one_campaign=False,
     ),
     "armpi": RealArm(
         robot="ArmPi FPV",

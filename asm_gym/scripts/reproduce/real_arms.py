@@ -45,6 +45,8 @@ RULE = "friction_rule"
 BODY = ", body"  # ends the name of a monitor that reads the arm's URDF
 WITH_BODY = tuple(name + BODY for name in ("neural_asm", "association_values", RULE))
 SEES = "sees"  # kind of the errors that a monitor says it sees
+HALF_SECOND = 0.5  # length of the windows in which senses may rest [s]
+AT_REST = 0.1  # share of these windows in which they do
 FOLDS = 4  # of which one is tested at a time
 
 
@@ -102,6 +104,8 @@ def run(config: Config) -> Findings:
     records = kit.records_of("watching", work, jobs, config)
     tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
     left_out = "".join(f" Left out: {reason}." for reason in missing)
+    others = [name for name in present if not ARMS[name].one_campaign]
+    tables += [noise_table(ARMS[name], config.folder) for name in others]
     tables[0] = replace(tables[0], caption=tables[0].caption + left_out)
     return Findings(records, tables)
 
@@ -284,6 +288,29 @@ def table(records: pd.DataFrame, arm: RealArm) -> Table:
         f"{MOST:.0%} of places, that it sees in tested pieces."
     )
     rows = [monitor_row(name, own, fewest) for (name, _), own in by_row]
+    return kit.table_of(caption, rows)
+
+
+def noise_table(arm: RealArm, folder: Path) -> Table:
+    """Return the noise of each channel at rest in healthy runs, and in those with faults.
+
+    Rest is the tenth of the half seconds of a run in which a sense varies least.
+    """
+    healthy, faulty = arm.episodes(folder)
+    rows = []
+    for kind, episodes in {"healthy": healthy, **faulty}.items():
+        of_runs = []
+        for episode in episodes:
+            length = round(HALF_SECOND / episode.spec.dt)
+            whole = episode.stream[: len(episode) // length * length]
+            deviations = whole.reshape(-1, length, episode.spec.size).std(axis=1)
+            of_runs.append(np.quantile(deviations, AT_REST, axis=0))
+        noise = np.median(of_runs, axis=0)
+        row: dict[str, str] = {"runs": kind}
+        for name, columns in episodes[0].spec.slices.items():
+            row[name] = f"{noise[columns].mean():.2g}"
+        rows.append(row)
+    caption = f"{arm.robot} ({arm.place}): deviation at rest, the median of runs"
     return kit.table_of(caption, rows)
 
 
