@@ -17,7 +17,8 @@ friction answers to all of its speed. Beyond its share the motors slow the arm d
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
-so that nothing drives it on, and for a moment nothing pushes with full force on what has stopped it.
+so that nothing drives it on, and for a moment nothing pushes with full force on what has stopped it. While a link but
+the hand touches something w is at least 0.95: near its base an arm presses hardest, and its wrist feels nothing of it.
 A motor that delivers less torque than it was commanded is commanded so much more while it brakes.
 """
 
@@ -59,6 +60,7 @@ REACHES = 0.15  # from fingers to the far end of what they hold, and from links 
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
 ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
 DRIVE_LOST_KEPT = 0.97  # share of w from substep to substep: half of it in 45 ms
+LEANING_DRIVE_LOST = 0.95  # while a link but the hand touches something
 LEAST_DRIVE_LOST = 0.02  # w from which on an arm counts as braked
 LEAST_SPEED = 1e-9  # no speed is divided by less [m/s]
 LEAST_INVERSE_MASS = 1e-4  # of a point that some directions cannot move [1/kg]
@@ -114,13 +116,14 @@ def fastest_point(views: Views, arm: Arm) -> float:
 
 
 @partial(inner, inlined=True)
-def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[float, float]:
-    """Return how soon a link of arm ``a`` touches an obstacle, and p, the largest momentum that counts [N s].
+def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[float, float, bool]:
+    """Return how soon a link of arm ``a`` touches an obstacle, p, and whether one but the hand does already.
 
     ``work.factor`` is the Cholesky factor of the arm's mass matrix.
     """
     soonest = 0.0
     hardest = 0.0
+    touches = False
     n = 0
     while arm.links[n] >= 0:
         if ahead.counts[a, n] == EVERYWHERE:
@@ -130,6 +133,7 @@ def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[
         for k in range(ahead.counts[a, n]):
             point = ahead.points[a, n, k]
             gap = present_gap(views, arm.links[n], point, work.place)
+            touches = touches or (n > 0 and gap <= 0.0)
             origin = views.subtree_com[arm.root]
             x, y, z = velocity_at(views.cvel[arm.links[n]], work.place, origin)
             soon = how_soon(point.way, gap, x, y, z)
@@ -138,7 +142,7 @@ def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[
                 soonest = max(soonest, soon)
                 hardest = max(hardest, soon * momentum)
         n += 1
-    return soonest, hardest
+    return soonest, hardest, touches
 
 
 @partial(inner, inlined=True)
@@ -223,8 +227,8 @@ def share_at(
 @partial(inner, inlined=True)
 def present_share(
     views: Views, arm: Arm, a: int, limit: SpeedLimit, ahead: Ahead, work: Work
-) -> float:
-    """Return the share that arm ``a`` may have of its present motion."""
+) -> tuple[float, bool]:
+    """Return the share that arm ``a`` may have of its present motion; and see ``approach``."""
     twist = work.twist
     for axis in range(6):
         twist[axis] = 0.0
@@ -232,10 +236,11 @@ def present_share(
             twist[axis] += work.jacobian[axis, i] * work.velocities[i]
     soon = 1.0
     momentum = 0.0
+    touches = False
     if limit.momentum < np.inf:
         cholesky(work.mass, arm.joint_count, work.factor)
-        soon, momentum = approach(views, arm, a, ahead, work)
-    return share_at(views, arm, a, limit, twist, soon, momentum)
+        soon, momentum, touches = approach(views, arm, a, ahead, work)
+    return share_at(views, arm, a, limit, twist, soon, momentum), touches
 
 
 @partial(inner, inlined=True)
@@ -256,10 +261,12 @@ def slow_down(
     limit = limits.motion[0]
     if is_beside_base(views, arm):
         limit = limits.motion[1]
-    share = present_share(views, arm, a, limit, limits.ahead, work)
+    share, touches = present_share(views, arm, a, limit, limits.ahead, work)
     share = min(share, speed_limit / speed)
     excess = max(0.0, 1.0 - share)
     goal.drive_lost = max(min(1.0, ALL_DRIVE * excess), DRIVE_LOST_KEPT * goal.drive_lost)
+    if touches:
+        goal.drive_lost = max(goal.drive_lost, LEANING_DRIVE_LOST)
     if excess == 0.0 and goal.drive_lost < LEAST_DRIVE_LOST:
         return False
     brake_motion(views, arm, goal, excess, work)
