@@ -8,6 +8,10 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.faults.action import ActionBias
 from asm_gym.faults.actuator import WeakJoint
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies import rollout
+from asm_gym.policies.hostile import HOSTILE
+from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.faults import FaultInjection
 from tests.hand_motion import link_momentum
 
@@ -63,6 +67,17 @@ def fall(strength):
 
 def test_a_weak_motor_is_commanded_more_while_the_arm_is_held():
     assert fall(0.5) < fall(1.0) + 0.001
+
+
+def test_an_upper_arm_that_leans_on_the_table_presses_it_with_little_force():
+    env = gym.make("asm_gym/Stack-v0", robot="Sawyer")
+    policy = HOSTILE["turning"](env, 1000, 1.0)  # which turns the elbow down
+    guarded = NeuralASMSafety(env, NeuralASM.pretrained("sawyer"))
+    forces = []
+    rollout(guarded, policy, 1000, lambda info: forces.append(info["contact_force"]))
+    env.close()
+    assert 40.0 < max(forces) < 280.0  # 748 N, driven on
+    assert np.mean(np.array(forces) > 100.0) < 0.02
 
 
 def test_a_tilted_hand_has_no_pace_in_tasks_whose_healthy_hands_point_down():
