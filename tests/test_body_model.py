@@ -205,7 +205,7 @@ def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_wit
         (arm().replace('<parent link="base"/>', ""), "the body cannot be read: .*parent"),
         (
             arm().replace('"elbow" type="continuous"', '"elbow" type="fixed"'),
-            "3 joints are sensed, and .* 2 that move",
+            r"3 joints are sensed, and .* 2 that move: .*\(lift, look, shoulder\)",
         ),
     ],
 )
@@ -295,6 +295,12 @@ def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
     assert estimate is not None
     assert 0 < float(estimate[1]) < float(estimate[2])
     assert load_monitor(tmp_path / "x.asm").get_params()["urdf"].startswith("<robot")
+    weightless = re.sub("<inertial>.*?</inertial>", "", arm())
+    (tmp_path / "arm.urdf").write_text(weightless)
+    assert main([*command, "--ignore", "*finger*"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "arm.urdf is not used" in said
+    assert "position[0] for lift, position[1] for shoulder, position[2] for elbow" in said
     assert main([*command, "--monitor", "kalman"]) == 2
     assert capsys.readouterr().err.strip().endswith("kalman takes no body model: leave --urdf out")
     (tmp_path / "arm.urdf").write_text("<robot")

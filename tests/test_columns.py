@@ -262,6 +262,20 @@ def test_every_refusal_names_what_gets_the_file_read_and_that_works_when_typed(
     assert main(["watch", str(path), "--monitor", str(tmp_path / "m.asm"), *to, *remedy]) < 2
 
 
+def test_numbers_of_a_short_log_that_others_hold_too_are_not_missing_data():
+    short = np.array([7305.0, 7305.0, 7249.0, 7250.0])
+    long = 7280.0 + 40.0 * Q
+    coded = long.copy()
+    coded[[5, 60, 61, 150]] = -25514.0
+    tables = [{"voltage": values, "position": values} for values in (short, long)]
+    for episode in Episode.from_tables(tables, rate=10.0):
+        assert np.isfinite(episode.stream).all()
+    tables = [{"voltage": coded, "position": long}, {"voltage": long, "position": long}]
+    first, second = Episode.from_tables(tables, rate=10.0)
+    assert np.isnan(first.stream).sum() == 4
+    assert np.isfinite(second.stream).all()
+
+
 def test_a_logger_that_was_started_twice_makes_two_logs(tmp_path):
     frame = pd.DataFrame(HEALTHY).to_csv(index=False)
     (tmp_path / "x.csv").write_text(frame + frame)

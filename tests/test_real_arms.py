@@ -17,8 +17,15 @@ from asm_gym.scripts.reproduce.added_faults import (
     jacobian,
     with_fault,
 )
-from asm_gym.scripts.reproduce.arm_recordings import ARMS, SERVO_CHANNELS, SLIP_RAD
-from asm_gym.scripts.reproduce.real_arms import Job, examined, fault_result, split
+from asm_gym.scripts.reproduce.arm_recordings import ARMS, SLIP_RAD
+from asm_gym.scripts.reproduce.real_arms import (
+    Job,
+    examined,
+    fault_result,
+    monitor_row,
+    noise_table,
+    split,
+)
 from tests.streams import pendulum_columns
 
 INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
@@ -134,16 +141,19 @@ def test_a_run_of_servos_is_cut_at_a_glitch_and_marked_rows_are_of_a_heated_serv
         folder = tmp_path / "matlab_ros_2024" / run
         folder.mkdir(parents=True)
         for motor in range(1, 7):
-            data = pd.DataFrame({name: rng.integers(100, 900, 400) for name in SERVO_CHANNELS})
+            ranges = {"position": (100, 900), "temperature": (20, 60), "voltage": (7000, 7500)}
+            data = pd.DataFrame({name: rng.integers(*r, 400) for name, r in ranges.items()})
             data["label"] = 0
             if motor == 3 and faulty:
                 data.loc[100:149, "label"] = 1
-            if motor == 5 and not faulty:
+            if motor == 5:  # each reading is a glitch
                 data.loc[200, "position"] = 4096 + 500
+                data.loc[201, "temperature"] = 255
+                data.loc[202, "voltage"] = -25514
             data.to_csv(folder / f"data_motor_{motor}.csv", index=False)
     runs = arm_recordings.armpi_runs(tmp_path)
-    assert [len(run["position[0]"]) for run in runs.healthy] == [150, 149]
-    assert [int(run["label"].sum()) for run in runs.faulty["glitch"]] == [1]
+    assert [len(run["position[0]"]) for run in runs.healthy] == [150, 147]
+    assert [int(run["label"].sum()) for run in runs.faulty["glitch"]] == [3, 3]
     assert [int(run["label"].sum()) for run in runs.faulty["heated"]] == [50]
     assert max(run["position[4]"].max() for run in runs.healthy) < 1000
 
@@ -162,6 +172,22 @@ def test_runs_of_hiro_hold_one_row_in_four_of_angles_force_and_torque(tmp_path):
     assert len(failed["force[0]"]) == 8  # of the shorter file
 
 
+def test_the_noise_of_runs_of_another_campaign_is_printed_beside_that_of_the_others(tmp_path):
+    rng = np.random.default_rng(0)
+    for group, noise in (("success", 0.01), ("error", 0.1)):
+        folder = tmp_path / ARMS["hiro"].place / group / "run-01"
+        folder.mkdir(parents=True)
+        t = np.arange(8000)[:, None] / 200
+        angles = np.sin(t * np.arange(1, 7) / 20)
+        np.savetxt(folder / "R_Angles.dat", np.hstack([t, angles]))
+        wrench = noise * rng.normal(size=(8000, 6))
+        np.savetxt(folder / "R_Torques.dat", np.hstack([t, wrench]))
+    table = noise_table(ARMS["hiro"], tmp_path)
+    force = table.headings.index("force")
+    assert float(table.rows[0][force]) == pytest.approx(0.01, rel=0.3)
+    assert float(table.rows[1][force]) == pytest.approx(0.1, rel=0.3)
+
+
 def test_pieces_are_dealt_out_once_and_no_more_is_learned_than_asked_for(folder):
     runs, _ = ARMS["ur10"].episodes(folder)
     tested = []
@@ -171,7 +197,7 @@ def test_pieces_are_dealt_out_once_and_no_more_is_learned_than_asked_for(folder)
         assert len({piece.stream.tobytes() for piece in parts}) == len(parts) == 15
         tested += use.tested
     assert len({piece.stream.tobytes() for piece in tested}) == 15
-    few = split(Job("ur10", "kalman", 0, 0), runs, minutes=3.01 / 60)
+    few = split(Job("ur10", "kalman", 0, 0, minutes=3.01 / 60), runs)
     assert len(few.learned) == 3
     assert len(few.tested) == 4
 
@@ -191,3 +217,26 @@ def test_a_fault_is_found_only_after_its_onset_and_without_an_alarm_before():
     assert found["found"]
     assert found["delay"] == pytest.approx(0.02)
     assert not fault_result(Unit(), "step", clip, Score([0, 2, 0.5, 0.9, 2]))["found"]
+
+
+def test_labelled_stretches_are_told_from_those_found_by_chance():
+    healthy = {"kind": "", "alarms": 6, "alarm_s": 0.0, "seconds": 3600.0, "excess": 0.5}
+    labelled = {"kind": "heated", "added": False, "found": True, "seconds": 600.0, "excess": 2.0}
+    common = {"promised": 6.0, "learned_min": 1.0, "delay": np.nan}
+    records = pd.DataFrame([common | healthy, common | labelled, common | labelled])
+    expected = 2 * (1 - np.exp(-1.0))  # six false alarms an hour, ten minutes each
+    assert monitor_row("any", records, 0)["heated"] == f"2 of 2 ({expected:.1f} by chance)"
+
+
+def test_from_more_minutes_a_monitor_finds_as_many_steps_or_more(monkeypatch, tmp_path):
+    monkeypatch.setattr(arm_recordings, "SYNTHETIC_EPISODES", 160)
+    arm_recordings.synthetic_runs.cache_clear()
+    found = []
+    for minutes in (0.5, 0.0):
+        job = Job("synthetic", "association_values", 0, 0, minutes=minutes)
+        records = pd.DataFrame(examined(job, tmp_path))
+        steps = records[records.kind == "step 20%"]
+        found.append(steps.found.mean())
+    arm_recordings.synthetic_runs.cache_clear()
+    assert found[1] >= found[0]
+    assert found[1] > 0.5

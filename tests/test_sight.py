@@ -8,7 +8,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.training_selection import pieces
 from asm_gym.monitors import make_monitor
 from asm_gym.monitors.monitor_protocol import Surprise
-from asm_gym.monitors.sight import clip_of, first_alarm, sights
+from asm_gym.monitors.sight import PLACES, first_alarm, seen_again, sights
 from tests.streams import pendulum_columns
 
 
@@ -18,19 +18,12 @@ def test_an_error_that_a_monitor_says_it_sees_is_found_on_held_out_pieces_and_a_
     monitor.calibrate(cut[40:60], 0.06)
     by_label = {sight.label: sight for sight in sights(monitor, cut[40:60])}
     assert {"effort[0]", "effort[1]", "position[0]", "position[1]"} == set(by_label)
-    column = monitor.spec.labels.index("effort[0]")
-    found = {}
-    for factor in (0.1, 1.0):
-        alarms = []
-        for piece in cut[60:80]:
-            clip, onset = clip_of(piece)
-            stream = clip.stream.copy()
-            stream[onset:, column] += factor * by_label["effort[0]"].size
-            score = monitor.score(Episode.from_stream(stream, clip.spec))
-            alarms.append(first_alarm(score, monitor.threshold, onset) is not None)
-        found[factor] = np.mean(alarms)
-    assert found[1.0] >= 0.6
-    assert found[0.1] <= 0.3
+    torque = by_label["effort[0]"]
+    small = torque._replace(size=torque.size / 10)
+    held_out = cut[60:80]
+    assert seen_again(monitor, [torque], held_out).mean() >= 0.6
+    assert seen_again(monitor, [small], held_out).mean() <= 0.3
+    assert seen_again(monitor, [torque], held_out).shape == (1, 2 * PLACES)
 
 
 def test_an_alarm_before_the_onset_hides_what_comes_after_it():

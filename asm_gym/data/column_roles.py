@@ -274,12 +274,10 @@ def _as_number(column: LogColumn, tables: Sequence[NDArray[Any]]) -> LogColumn:
     if wrap:
         reasons.append(f"turns over at {wrap:g}: read as its sine and cosine")
     missing = None
-    for values in tables:
-        sentinel = missing_value_sentinel(values)
-        if not math.isnan(sentinel):
-            missing = sentinel
-            reasons.append(f"{sentinel:g} is taken for missing data")
-            break
+    sentinel = missing_value_sentinel(np.concatenate(tables))
+    if not math.isnan(sentinel):
+        missing = sentinel
+        reasons.append(f"{sentinel:g} is taken for missing data")
     return replace(column, wrap=wrap, missing=missing, reason="; ".join(reasons))
 
 

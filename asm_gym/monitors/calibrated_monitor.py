@@ -265,7 +265,7 @@ class CalibratedMonitor:
 
         for_threshold = [e for n, e in enumerate(episodes) if n not in for_ceilings]
         groups = [group for n, group in enumerate(each) if n not in for_ceilings]
-        new = new._balanced(for_threshold)
+        new = new._balanced(for_threshold, rate)
         new._set_threshold(for_threshold, rate, groups)
         new._keep_healthy_ranges(episodes)
         self._become(new)
@@ -343,8 +343,8 @@ class CalibratedMonitor:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
 
-    def _balanced(self, episodes: Sequence[Episode]) -> Self:
-        """Return a copy that weighs several judgements against each other by nominal episodes; itself with just one."""
+    def _balanced(self, episodes: Sequence[Episode], rate: AlarmRate) -> Self:
+        """Return a copy in which several judgements share the rate in nominal episodes; itself with just one."""
         return self
 
     @typed

@@ -78,7 +78,13 @@ class AlarmRate(NamedTuple):
         """Return whether so many nominal episodes are enough to promise this rate."""
         if self.per == EPISODE:
             return len(episodes) >= conformal_episodes(self.rate)
-        return self.rate * sum(len(e) * e.spec.dt for e in episodes) / 3600 >= 1.0
+        return self.expected(episodes) >= 1.0
+
+    def expected(self, episodes: Sequence[Episode]) -> float:
+        """Return how many alarms in these nominal episodes the rate allows."""
+        if self.per == EPISODE:
+            return self.rate * len(episodes)
+        return self.rate * sum(len(e) * e.spec.dt for e in episodes) / 3600
 
     def check_hours(self, hours: float) -> None:
         """Raise ValueError where the hours are too few for a rate by the hour."""

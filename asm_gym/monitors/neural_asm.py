@@ -24,6 +24,7 @@ from asm_gym.memory.dynamics import DYNAMICS, RECURRENT
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.blame import Blame
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_config import (
     ASSOCIATION_UNITS,
@@ -299,14 +300,15 @@ class NeuralASM(CalibratedMonitor):
             self._kernel = RowKernel(memory, self.detection, self.excuses_)
         return self._kernel
 
-    def _balanced(self, episodes: Sequence[Episode]) -> Self:
-        """Return a copy in which values weigh as much as changes, by nominal episodes."""
+    def _balanced(self, episodes: Sequence[Episode], rate: AlarmRate) -> Self:
+        """Return a copy in which values and changes take half of the rate each, in nominal episodes."""
         if self.values_ is None:
             return self
         other = self._copy()
         other.values_ = self.values_.of_changes_alone()
         by_changes = other.score_episodes(episodes)
-        other.values_ = self.values_.balanced(by_changes, episodes)
+        expected = rate.expected(episodes)
+        other.values_ = self.values_.balanced(by_changes, episodes, expected)
         return other
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:

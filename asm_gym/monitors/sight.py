@@ -70,7 +70,17 @@ class Errors(NamedTuple):
         low, high = np.quantile(rows, RANGE, axis=0)
         columns = np.union1d(torque_columns(spec), position_columns(spec)).astype(np.intp)
         columns = columns[(high - low)[columns] > 0]
-        sizes = np.outer((high - low)[columns], shares)
+        return cls.at(episodes, columns, np.outer((high - low)[columns], shares))
+
+    @classmethod
+    def at(
+        cls,
+        episodes: Sequence[Episode],
+        columns: NDArray[np.intp],
+        sizes: NDArray[np.float64],
+    ) -> Self:
+        """Add errors of these sizes (C, A) to columns (C,), at places in the middle of episodes."""
+        spec = episodes[0].spec
         last = len(episodes) - 1
         chosen = np.unique(np.linspace(0, last, PLACES).round().astype(np.intp))
         places = [clip_of(episodes[n]) for n in chosen]
@@ -90,15 +100,33 @@ def sights(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> list[Sigh
     errors = Errors.of(episodes, SHARES)
     if not errors.clips:
         return []
-    is_seen = []
-    for score, onset in zip(monitor.score_episodes(errors.clips), errors.onsets, strict=True):
-        is_seen.append(first_alarm(score, monitor.threshold, onset) is not None)
-    seen = np.reshape(is_seen, (*errors.sizes.shape, -1)).mean(axis=2)
+    seen = _is_seen(monitor, errors).mean(axis=2)
     spec = monitor.spec
     return [
         _least(spec.labels[column], spec.units[column], of_column, own_sizes)
         for column, of_column, own_sizes in zip(errors.columns, seen, errors.sizes, strict=True)
     ]
+
+
+def seen_again(
+    monitor: CalibratedMonitor, sizes: Sequence[Sight], episodes: Sequence[Episode]
+) -> NDArray[np.bool_]:
+    """Return which errors (C, P), of the sizes that a monitor says it sees, it sees in other episodes."""
+    finite = [sight for sight in sizes if math.isfinite(sight.size)]
+    if not finite:
+        return np.zeros((0, 2 * PLACES), bool)
+    columns = [monitor.spec.labels.index(sight.label) for sight in finite]
+    each_size = np.array([[sight.size] for sight in finite])
+    errors = Errors.at(episodes, np.array(columns, np.intp), each_size)
+    return _is_seen(monitor, errors)[:, 0]
+
+
+def _is_seen(monitor: CalibratedMonitor, errors: Errors) -> NDArray[np.bool_]:
+    """Return which errors raise an alarm (C, A, P)."""
+    is_seen = []
+    for score, onset in zip(monitor.score_episodes(errors.clips), errors.onsets, strict=True):
+        is_seen.append(first_alarm(score, monitor.threshold, onset) is not None)
+    return np.reshape(is_seen, (*errors.sizes.shape, -1))
 
 
 def _least(label: str, unit: str, seen: NDArray[np.float64], sizes: NDArray[np.float64]) -> Sight:

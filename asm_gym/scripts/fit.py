@@ -292,13 +292,13 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         f"with it the squared error of held-out torques is {model.left_by_body:.2f} "
         "of that without it"
     )
+    joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
     if model.body is None:
         yield (
-            f"{args.urdf} is not used: {gain}; "
-            "check its masses, and that it names joints as the log does"
+            f"{args.urdf} is not used: {gain}; check its masses, and that it names joints as the "
+            f"log does, which were taken so: {joints}"
         )
         return
-    joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
     assigned = "by the best fit to the torques, as no column names a joint"
     if model.body.by_name:
         assigned = "by name"

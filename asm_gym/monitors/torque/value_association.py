@@ -134,8 +134,8 @@ class ValueAssociation(ScaledModel):
 
     @property
     def joints(self) -> list[tuple[str, str]]:
-        """The angles that a body model is told, and the joint that each is taken for."""
-        body = self.body
+        """The angles that a body model is told, and the joint that each is taken for, whether it is used or not."""
+        body = self.body or self._by_body.body
         if body is None:
             return []
         joint_of = dict(zip(body.columns.tolist(), body.names, strict=True))

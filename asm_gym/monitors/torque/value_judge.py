@@ -1,10 +1,11 @@
 """Values beside changes: a push that is held is explained by its own past for changes, and not by the other senses.
 
-    s = max(s_changes / √f, b s_values^p)   b, p: log b + p log s_values has centre and spread of log s_changes
+    s = max(s_changes / √f, b s_values^p)   p: p log s_values has the spread of log s_changes;  b: see below
     f = max(1, (1 + τ h)/(1 + τ h̃))         h: leverage of a row, h̃ its median in the episodes learned from
     h = zᵀ (ZᵀZ + λ N)⁻¹ z                  z: inputs that changes are predicted from, and 1;  τ: rows of a tenth of a s
 
-``calibrate`` finds b and p from the maxima of nominal episodes, so that both are as likely to pass the one threshold.
+``calibrate`` finds b and p from the maxima of nominal episodes: of the alarms in them that the promised rate allows,
+values raise half and changes half. Each then has the threshold that it would have by itself for half of the rate.
 A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
 a tenth of a second count as one.
 """
@@ -119,12 +120,15 @@ class ValueJudge:
         """Return it with b of 0, so that values count for nothing."""
         return replace(self, balance=0.0)
 
-    def balanced(self, changes: Sequence[Surprise], episodes: Sequence[Episode]) -> Self:
+    def balanced(
+        self, changes: Sequence[Surprise], episodes: Sequence[Episode], expected: float
+    ) -> Self:
         """Return it with b and p from nominal episodes.
 
         Args:
             changes: surprise of these episodes by changes alone.
             episodes: nominal.
+            expected: alarms in them that the promised rate allows.
         """
         by_changes = self._log_maxima(changes)
         by_values = self._log_maxima(self.monitor.score_episodes(episodes))
@@ -132,7 +136,8 @@ class ValueJudge:
         variance_of_values = _variance(by_values, PRIOR_SPREAD_OF_VALUES)
         ratio = np.sqrt(variance_of_changes / variance_of_values)
         power = min(float(ratio), MOST_POWER)
-        log_balance = np.median(by_changes) - power * np.median(by_values)
+        place = -max(1, min(round(expected / 2), len(by_changes)))
+        log_balance = np.sort(by_changes)[place] - power * np.sort(by_values)[place]
         return replace(self, balance=float(np.exp(log_balance)), power=power)
 
     def _log_maxima(self, scores: Sequence[Surprise]) -> Floats:

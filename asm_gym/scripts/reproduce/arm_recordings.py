@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,24 @@ from numpy.typing import NDArray
 from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode
 from asm_gym.readings import spans
+from asm_gym.rollouts.run_trials import collect
 
 Columns = dict[str, NDArray[Any]]
 
 SLIP_RAD = 0.05  # of an encoder [rad]
-SERVO_UNITS = 1000  # highest position of a bus servo, that is 240°; readings beyond it are glitches
+SERVO_UNITS = 1000  # highest position of a bus servo, that is 240°
+# Readings of a bus servo that can be true; others are glitches.
+SERVO_RANGES = {
+    "position": (0.0, SERVO_UNITS),
+    "temperature": (0.0, 100.0),  # [°C]
+    "voltage": (4500.0, 9000.0),  # [mV]
+}
 GLITCH_ROWS = 50  # of a run before and after a glitch that are watched
 UNMARKED_FAILURE = "20240325_155003"
 HIRO_EVERY = 4  # rows of HIRO of which one is read: 50 of 200 a second
+HIRO_REPEATED = slice(3, 19)  # good runs of HIRO, numbered from 2, that repeat one programme
+SYNTHETIC_EPISODES = 1920  # of 4 s: 128 min, half of which are learned from
+SYNTHETIC_EVERY = 4  # rows of the synthetic arm of which one is read: 25 of 100 a second
 
 
 @dataclass(frozen=True)
@@ -54,6 +65,7 @@ class RealArm:
     )  # channels of torques, or of force and torque at the wrist
     slip: float = SLIP_RAD  # of an encoder, in units of its position
     has_joint_torques: bool = True
+    one_campaign: bool = True  # its runs with faults were recorded as the healthy ones were
 
     def episodes(self, folder: Path) -> tuple[list[Episode], dict[str, list[Episode]]]:
         """Return the healthy runs as episodes, and those with faults by their kind."""
@@ -120,16 +132,24 @@ def weigand_mats(folder: Path) -> Runs:
 def hiro_runs(folder: Path) -> Runs:
     """Read good and failed snap assemblies: angles, and force and torque at the wrist."""
 
-    def run(path: Path) -> Columns:
-        angles = _numbers(path / "R_Angles.dat")
-        wrench = _numbers(path / "R_Torques.dat")
-        rows = slice(0, min(len(angles), len(wrench)), HIRO_EVERY)
-        force = wrench[rows, 1:4]
-        return numbered(position=angles[rows, 1:], force=force, torque=wrench[rows, 4:])
+    def runs(group: str) -> list[Columns]:
+        return [hiro_run(path.parent) for path in sorted(folder.glob(f"{group}/*/R_Angles.dat"))]
 
-    good = [run(path.parent) for path in sorted(folder.glob("success/*/R_Angles.dat"))]
-    failed = [run(path.parent) for path in sorted(folder.glob("error/*/R_Angles.dat"))]
-    return Runs(good, {"failed": failed})
+    return Runs(runs("success"), {"failed": runs("error")})
+
+
+def hiro_repetitions(folder: Path) -> Runs:
+    """Read the good assemblies of one programme, runs 5 to 20, whose angles differ by less than 0.0003 rad."""
+    runs = hiro_runs(folder)
+    return Runs(runs.healthy[HIRO_REPEATED], runs.faulty)
+
+
+def hiro_run(folder: Path) -> Columns:
+    """Read one snap assembly."""
+    angles = _numbers(folder / "R_Angles.dat")
+    wrench = _numbers(folder / "R_Torques.dat")
+    rows = slice(0, min(len(angles), len(wrench)), HIRO_EVERY)
+    return numbered(position=angles[rows, 1:], force=wrench[rows, 1:4], torque=wrench[rows, 4:])
 
 
 def _numbers(path: Path) -> NDArray[np.float64]:
@@ -140,40 +160,57 @@ def _numbers(path: Path) -> NDArray[np.float64]:
 def armpi_runs(folder: Path) -> Runs:
     """Read runs of six bus servos; those with marked rows have a heated servo.
 
-    Healthy runs are cut where a reading is a glitch, and each glitch is a run of a few seconds. A run that its
-    authors list as failing, and in which no row is marked, is of neither kind.
+    Runs are cut where a reading is a glitch, and each glitch is a run of a few seconds. A run that its authors list as
+    failing, and in which no row is marked, is left out.
     """
-    healthy: list[Columns] = []
-    heated: list[Columns] = []
-    glitches: list[Columns] = []
+    runs = Runs([], {"heated": [], "glitch": []})
     for path in sorted(folder.glob("matlab_ros_2024/*")):
         if path.name == UNMARKED_FAILURE:
             continue
         motors = [pd.read_csv(path / f"data_motor_{n}.csv") for n in range(1, 7)]
-        run = numbered(**{name: _side_by_side(motors, name) for name in SERVO_CHANNELS})
+        run = numbered(**{name: _side_by_side(motors, name) for name in SERVO_RANGES})
         is_heated = np.asarray(_side_by_side(motors, "label").any(axis=1))
-        if is_heated.any():
-            heated.append({**run, "label": is_heated})
-            continue
-        position = _side_by_side(motors, "position")
-        is_glitch = np.asarray(((position < 0) | (position > SERVO_UNITS)).any(axis=1))
+        is_glitch = np.zeros(len(is_heated), bool)
+        for name, (low, high) in SERVO_RANGES.items():
+            reading = _side_by_side(motors, name)
+            is_outside = (reading < low) | (reading > high)
+            is_glitch |= np.asarray(is_outside.any(axis=1))
         window = np.ones(2 * GLITCH_ROWS + 1)
         is_near = np.convolve(is_glitch, window, "same") > 0
-        labelled = {**run, "label": is_glitch}
-        glitches += [_rows(labelled, *span) for span in spans(is_near)]
-        healthy += [_rows(run, *span) for span in spans(~is_near)]
-    return Runs(healthy, {"heated": heated, "glitch": glitches})
+
+        runs.faulty["glitch"].extend(_parts({**run, "label": is_glitch}, is_near))
+        if not is_heated.any():
+            runs.healthy.extend(_parts(run, ~is_near))
+            continue
+        parts = _parts({**run, "label": is_heated}, ~is_near)
+        runs.faulty["heated"].extend(part for part in parts if part["label"].any())
+    return runs
 
 
-def _rows(run: Columns, start: int, stop: int) -> Columns:
-    return {name: values[start:stop] for name, values in run.items()}
-
-
-SERVO_CHANNELS = ("position", "temperature", "voltage")
+def _parts(run: Columns, is_kept: NDArray[np.bool_]) -> list[Columns]:
+    """Return each stretch of rows (T,) that are kept."""
+    return [
+        {name: values[start:stop] for name, values in run.items()} for start, stop in spans(is_kept)
+    ]
 
 
 def _side_by_side(motors: Iterable[pd.DataFrame], name: str) -> NDArray[np.float64]:
     return np.stack([motor[name].to_numpy(np.float64) for motor in motors], axis=1)
+
+
+@cache
+def synthetic_runs(_: Path) -> Runs:
+    """Simulate episodes of the synthetic arm, each through poses of its own, with a load of its own."""
+    episodes = collect(
+        "asm_gym/SyntheticArm-v0", "scripted", episodes=SYNTHETIC_EPISODES, seed=0, workers=1
+    )
+    runs = []
+    for episode in episodes:
+        rows = episode.stream[::SYNTHETIC_EVERY]
+        position, velocity, effort, command = np.split(rows, 4, axis=1)
+        run = numbered(position=position, velocity=velocity, effort=effort, command=command)
+        runs.append(run)
+    return Runs(runs)
 
 
 SECONDS = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
@@ -220,6 +257,18 @@ ARMS = {
         rate=50.0,
         efforts=("force", "torque"),
         has_joint_torques=False,
+        one_campaign=False,
+    ),
+    "hiro_repeated": RealArm(
+        robot="Kawada HIRO, one programme",
+        place="hiro_snap_assembly",
+        source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
+        read=hiro_repetitions,
+        piece_s=np.inf,
+        rate=50.0,
+        efforts=("force", "torque"),
+        has_joint_torques=False,
+        one_campaign=False,
     ),
     "armpi": RealArm(
         robot="ArmPi FPV",
@@ -232,5 +281,14 @@ ARMS = {
         slip=SLIP_RAD * SERVO_UNITS / np.deg2rad(240),
         has_joint_torques=False,
     ),
+    "synthetic": RealArm(
+        robot="Synthetic arm",
+        place="",
+        source="simulated",
+        read=synthetic_runs,
+        piece_s=np.inf,
+        rate=25.0,
+    ),
 }
-"""Sets by name; the first three are of seconds, the others of minutes."""
+"""Sets by name; the first three are of seconds, the others of minutes, and the last one is simulated."""
+REAL = tuple(name for name in ARMS if ARMS[name].place)

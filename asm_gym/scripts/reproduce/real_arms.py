@@ -29,14 +29,14 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.monitor_protocol import Surprise
-from asm_gym.monitors.sight import clip_of, first_alarm
+from asm_gym.monitors.sight import MOST, clip_of, first_alarm, seen_again, sights
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.readings import spans
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.added_faults import ADDED_FAULTS, POSITION, Piece, with_fault
-from asm_gym.scripts.reproduce.arm_recordings import ARMS, RealArm
+from asm_gym.scripts.reproduce.arm_recordings import ARMS, REAL, RealArm
 from asm_gym.scripts.reproduce.kit import Findings, Record
 
 Floats = NDArray[np.float64]
@@ -44,6 +44,9 @@ Floats = NDArray[np.float64]
 RULE = "friction_rule"
 BODY = ", body"  # ends the name of a monitor that reads the arm's URDF
 WITH_BODY = tuple(name + BODY for name in ("neural_asm", "association_values", RULE))
+SEES = "sees"  # kind of the errors that a monitor says it sees
+HALF_SECOND = 0.5  # length of the windows in which senses may rest [s]
+AT_REST = 0.1  # share of these windows in which they do
 FOLDS = 4  # of which one is tested at a time
 
 
@@ -55,17 +58,19 @@ class Config(kit.Config):
     """Folder of the recordings."""
     seeds: int = option(1, least=1)
     """How often pieces are drawn anew."""
-    experiments: tuple[str, ...] = option(tuple(ARMS), quick=("panda",), least=1, known=ARMS)
-    """Recordings; missing ones are left out, and named."""
+    experiments: tuple[str, ...] = option(REAL, quick=("panda",), least=1, known=ARMS)
+    """Recordings; missing ones are left out, and named. One set is simulated."""
     monitors: tuple[str, ...] = option(
-        ("neural_asm", "association_values", RULE, "gru", "kalman"),
+        ("neural_asm", "association_values", RULE, RULE + BODY, "gru", "kalman"),
         quick=("association_values", RULE),
         least=1,
         known=(*MONITORS, *WITH_BODY, RULE),
     )
     """Monitors; those named with a body read the arm's URDF."""
-    minutes: float = option(0.0)
-    """Most minutes to learn from; 0 for all that there are."""
+    folds: int = option(FOLDS, least=1)
+    """How many of the four quarters are tested, in turn."""
+    minutes: tuple[float, ...] = option((0.0,), least=1)
+    """Most minutes to learn from, in turn; 0 for all that there are."""
 
 
 class Job(NamedTuple):
@@ -75,6 +80,7 @@ class Job(NamedTuple):
     monitor: str
     seed: int
     fold: int
+    minutes: float = 0.0  # most to learn from; 0 for all
 
 
 def run(config: Config) -> Findings:
@@ -83,19 +89,23 @@ def run(config: Config) -> Findings:
     missing = []
     for name in config.experiments:
         path = config.folder / ARMS[name].place
-        if path.exists():
+        if path.exists() or not ARMS[name].place:
             present.append(name)
         else:
             missing.append(f"{path} is missing: it is {ARMS[name].source}")
     if not present:
         raise FileNotFoundError("; ".join(missing))
 
-    grid = product(present, config.monitors, config.repetitions, range(FOLDS))
+    grid = product(
+        present, config.monitors, config.repetitions, range(config.folds), config.minutes
+    )
     jobs = [job for job in map(Job._make, grid) if is_possible(job)]
-    work = partial(examined, folder=config.folder, minutes=config.minutes)
+    work = partial(examined, folder=config.folder)
     records = kit.records_of("watching", work, jobs, config)
     tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
     left_out = "".join(f" Left out: {reason}." for reason in missing)
+    others = [name for name in present if not ARMS[name].one_campaign]
+    tables += [noise_table(ARMS[name], config.folder) for name in others]
     tables[0] = replace(tables[0], caption=tables[0].caption + left_out)
     return Findings(records, tables)
 
@@ -116,7 +126,7 @@ class Split(NamedTuple):
     tested: list[Episode]
 
 
-def split(job: Job, runs: Sequence[Episode], minutes: float = 0.0) -> Split:
+def split(job: Job, runs: Sequence[Episode]) -> Split:
     """Cut runs into pieces, and deal them out for one fold."""
     parts = [part for whole in runs for part in complete_parts(whole)]
     cut = parts
@@ -131,9 +141,9 @@ def split(job: Job, runs: Sequence[Episode], minutes: float = 0.0) -> Split:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {piece_s:g} s: too few")
     is_learned = np.arange(len(others)) % 3 > 0
     learned = [cut[i] for i in others[is_learned]]
-    if minutes:
+    if job.minutes:
         ends = np.cumsum([minutes_of([piece]) for piece in learned])
-        learned = learned[: max(1, int((ends <= minutes).sum()))]
+        learned = learned[: max(1, int((ends <= job.minutes).sum()))]
     return Split(
         learned=learned,
         calibration=[cut[i] for i in others[~is_learned]],
@@ -156,11 +166,11 @@ def read_body(folder: Path, arm: RealArm) -> str:
     return read_urdf(path)
 
 
-def examined(job: Job, folder: Path, minutes: float = 0.0) -> list[Record]:
+def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, for each fault in it, and for each labelled fault."""
     arm = ARMS[job.experiment]
     runs, labelled = arm.episodes(folder)
-    use = split(job, runs, minutes)
+    use = split(job, runs)
     urdf = read_body(folder, arm)
     monitor = fitted(job, use.learned, urdf)
     promised = 60.0 / minutes_of(use.calibration)  # the fewest that it can promise [1/h]
@@ -173,6 +183,8 @@ def examined(job: Job, folder: Path, minutes: float = 0.0) -> list[Record]:
     for kind, clip, score in zip(kinds, clips, monitor.score_episodes(clips), strict=True):
         records.append(about | fault_result(monitor, kind, clip, score))
     if job.fold == 0:
+        again = seen_again(monitor, sights(monitor, use.calibration), use.tested)
+        records += [about | {"kind": SEES, "found": found} for found in again.ravel()]
         for kind, episodes in labelled.items():
             for episode, score in zip(episodes, monitor.score_episodes(episodes), strict=True):
                 records += [about | one for one in labelled_results(monitor, kind, episode, score)]
@@ -256,40 +268,75 @@ def labelled_results(
     records = []
     for start, stop in spans(is_faulty):
         excess = float(score.value[start:stop].max() / monitor.threshold)
-        records.append({"kind": kind, "added": False, "found": excess > 1, "excess": excess})
+        seconds = (stop - start) * episode.spec.dt
+        record = {"kind": kind, "added": False, "found": excess > 1, "excess": excess}
+        records.append({**record, "seconds": seconds})
     return records
 
 
 def table(records: pd.DataFrame, arm: RealArm) -> Table:
-    """Return the table of a recording, a row for each monitor."""
+    """Return the table of a recording, a row for each monitor and for each length that it learned from."""
+    by_row = records.groupby(["monitor", "minutes"], sort=False)
     healthy = records[records.kind == ""]
-    monitors = records.groupby("monitor", sort=False)
-    pieces_over = (healthy.excess > 1).groupby(healthy.monitor).sum()
-    fewest = int(pieces_over.min())
-    seconds = healthy.seconds.sum() / len(monitors)
+    over = (healthy.excess > 1).groupby([healthy.monitor, healthy.minutes]).sum()
+    fewest = int(over.min())
+    seconds = healthy.seconds.sum() / by_row.ngroups
     caption = (
-        f"{arm.robot} ({arm.place}), {seconds / 60:.1f} min as recorded, learned from "
-        f"{healthy.learned_min.mean():.1f} min. * added to the recording, found within a second. "
-        f"At {fewest}: faults found by the threshold that {fewest} healthy pieces pass."
+        f"{arm.robot} ({arm.place}), {seconds / 60:.1f} min as recorded. * added to the recording, "
+        f"found within a second. At {fewest}: added faults found by the threshold that {fewest} "
+        "healthy pieces pass. Sees again: errors of the sizes that it says it sees in "
+        f"{MOST:.0%} of places, that it sees in tested pieces."
     )
-    return kit.table_of(caption, [monitor_row(name, own, fewest) for name, own in monitors])
+    rows = [monitor_row(name, own, fewest) for (name, _), own in by_row]
+    return kit.table_of(caption, rows)
+
+
+def noise_table(arm: RealArm, folder: Path) -> Table:
+    """Return the noise of each channel at rest in healthy runs, and in those with faults.
+
+    Rest is the tenth of the half seconds of a run in which a sense varies least.
+    """
+    healthy, faulty = arm.episodes(folder)
+    rows = []
+    for kind, episodes in {"healthy": healthy, **faulty}.items():
+        of_runs = []
+        for episode in episodes:
+            length = round(HALF_SECOND / episode.spec.dt)
+            whole = episode.stream[: len(episode) // length * length]
+            deviations = whole.reshape(-1, length, episode.spec.size).std(axis=1)
+            of_runs.append(np.quantile(deviations, AT_REST, axis=0))
+        noise = np.median(of_runs, axis=0)
+        row: dict[str, str] = {"runs": kind}
+        for name, columns in episodes[0].spec.slices.items():
+            row[name] = f"{noise[columns].mean():.2g}"
+        rows.append(row)
+    caption = f"{arm.robot} ({arm.place}): deviation at rest, the median of runs"
+    return kit.table_of(caption, rows)
 
 
 def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]:
     """Return the row of a monitor.
 
-    Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass.
+    Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass. Of labelled stretches of rows
+    some are found by chance, at the rate of false alarms.
     """
     healthy = records[records.kind == ""]
-    faulty = records[records.kind != ""]
+    again = records[records.kind == SEES]
+    faulty = records[~records.kind.isin(("", SEES))]
+    raised = Rate(int(healthy.alarms.sum()), healthy.seconds.sum() / 3600)
     row = {
         "Monitor": name,
+        "learned [min]": f"{healthy.learned_min.mean():.3g}",
         "promised [1/h]": f"{healthy.promised.mean():.0f}",
-        "raised [1/h]": Rate(int(healthy.alarms.sum()), healthy.seconds.sum() / 3600).text,
+        "raised [1/h]": raised.text,
     }
     for kind, own in faulty.groupby("kind", sort=False):
-        star = " *" if own.added.all() else ""
-        row[f"{kind}{star}"] = f"{own.found.astype(int).sum()} of {len(own)}"
+        cell = f"{own.found.astype(int).sum()} of {len(own)}"
+        if own.added.all():
+            row[f"{kind} *"] = cell
+            continue
+        by_chance = 1.0 - np.exp(-raised.value * own.seconds / 3600)
+        row[kind] = f"{cell} ({by_chance.sum():.1f} by chance)"
     row["delay [s]"] = ""
     if records.delay.notna().any():
         row["delay [s]"] = f"{records.delay.median():.3g}"
@@ -297,5 +344,6 @@ def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]
     added = faulty[faulty.added.astype(bool)]
     comparable_threshold = healthy.excess.nlargest(fewest + 1).iloc[-1]
     row[f"at {fewest}"] = f"{(added.excess > comparable_threshold).sum()} of {len(added)}"
+    row["sees again"] = f"{again.found.astype(int).sum()} of {len(again)}"
     row["time in alarm"] = f"{100 * healthy.alarm_s.sum() / healthy.seconds.sum():.1f} %"
     return row
