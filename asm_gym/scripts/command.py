@@ -136,7 +136,7 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
     named = [each.name for each in all_fields if not each.metadata.get("positional")]
     options = ["--" + field_name.replace("_", "-") for field_name in named] + ["--help"]
     values = {each.name: each.metadata.get("metavar") for each in all_fields}
-    for word, following in zip(args, [*args[1:], "--"], strict=True):
+    for word, following in zip(args, [*args[1:], "--"], strict=False):
         if word.startswith("--") and not word.startswith("--tyro-"):
             option_name, given, _ = word.partition("=")
             check_choice("option", option_name.replace("_", "-"), options)
