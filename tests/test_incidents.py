@@ -20,6 +20,7 @@ def row(
     strengths: dict[int, float],
     broken: tuple[int, ...] = (),
     follows: bool = False,
+    blamed: tuple[int, ...] = (),
 ) -> AlarmRow:
     """A row in alarm whose channels have these strengths, in thresholds, at a threshold of 2."""
     r = np.zeros(SIZE)
@@ -35,7 +36,7 @@ def row(
         numbers[list(broken)] = np.nan
         shares = np.where(np.isnan(numbers), np.inf, 0.0)
         surprise = np.inf
-    return AlarmRow(time, numbers, shares, float(surprise), 2.0, follows)
+    return AlarmRow(time, numbers, shares, float(surprise), 2.0, follows, lambda: blamed)
 
 
 def opened(*rows: AlarmRow) -> list[tuple[float, int | None, str]]:
@@ -66,6 +67,21 @@ def test_a_fault_that_spreads_is_one_incident():
     spreading = [row(1.0, {2: 9.0}), row(2.0, {2: 9.0, 3: 4.0}), row(30.0, {5: 7.0})]
     assert opened(*spreading) == [(1.0, 2, "surprise")]
     assert len(opened(*spreading, row(31.0, {5: 9.0}))) == 2  # more than its spread explains
+
+
+def test_what_blame_explains_by_a_channel_at_fault_is_no_other_cause():
+    first = row(1.0, {2: 9.0}, blamed=(2,))
+    poisoned = [row(40.0 + n, {2: 500.0, 5: 7.0 + n}, blamed=(2,)) for n in range(3)]
+    assert opened(first, *poisoned) == [(1.0, 2, "surprise")]
+    other = row(50.0, {2: 500.0, 4: 30.0, 5: 40.0}, blamed=(2, 4))
+    assert opened(first, *poisoned, other) == [(1.0, 2, "surprise"), (50.0, 4, "surprise")]
+
+
+def test_a_cause_that_shows_elsewhere_in_another_part_of_the_work_is_one_incident():
+    work = [row(1.0, {2: 2.0}), row(5.0, {2: 2.0, 5: 0.9}), row(9.0, {2: 2.0, 5: 1.7})]
+    assert len(opened(*work, row(60.0, {4: 3.3}))) == 1
+    assert len(opened(*work, row(60.0, {4: 3.5}))) == 2
+    assert len(opened(*work, row(30.0, {2: 2.0, 5: 3.3}), row(60.0, {4: 3.5}))) == 2
 
 
 def test_each_channel_that_is_missing_is_a_cause_and_surprise_after_a_gap_is_none():

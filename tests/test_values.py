@@ -172,6 +172,23 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
         ValueJudge.restored(cut[0].spec, old, seed=0)
 
 
+def test_a_whole_episode_is_scored_as_row_by_row():
+    cut = pieces(Episode.from_table(pendulum_columns()), 1.0)
+    asm = NeuralASM(cut[0].spec, hidden_size=8, association_size=16, epochs=1)
+    asm.fit(cut[:30]).calibrate(cut[30:45], 0.07)
+    assert asm.values_ is not None
+    episodes = [pushed(cut[45], 1.0), replace(cut[46], stream=cut[46].stream[:37].copy())]
+    episodes[1].stream[20, 1] = np.nan
+    for episode, score in zip(episodes, asm.score_episodes(episodes), strict=True):
+        state = asm.initial_state()
+        for t, row in enumerate(episode.stream):
+            state, surprise = asm.observe(state, row[None])
+            assert score.value[t] == pytest.approx(surprise.value[0], rel=1e-6)
+            np.testing.assert_allclose(
+                score.attribution[t], surprise.attribution[0], rtol=1e-5, atol=1e-6
+            )
+
+
 def test_the_rule_takes_friction_from_torque_and_needs_a_speed():
     columns = pendulum_columns()
     columns["effort"] -= 5 * np.sin(columns["position"])  # gravity is none of its business

@@ -2,12 +2,15 @@
 
     strength    r_i = (a_i s^(p-1))^(1/p) / q      of channel i, in thresholds; (Σ r_i^p)^(1/p) = s/q
     opens       row in alarm, and no incident of a minute before explains it
-    explains    (Σ r_i^p)^(1/p) <= max(1, 2 m) over the channels i of no open incident
+    explains    (Σ r_i^p)^(1/p) <= max(1, 2 m) over the channels i of no open incident;
+                or what blame points to are channels of open incidents alone
     ends        a minute without a row of its own; of a snoozed one, when that time is over
 
 s is surprise, q its threshold, a_i the share of channel i, and p how the detection pools. A row in ``SETTLING_S`` from
-an incident's start adds its channels to it; m is the greatest strength in channels that were added, so that a
-fault which spreads is one incident, and a fault elsewhere opens another at once.
+an incident's start adds its channels to it; m is the greatest strength in channels that were added, or elsewhere in
+``SPREADING_S``, so that a fault which spreads is one incident, and a fault elsewhere opens another at once. A large
+error grows with what the robot does, and so does its share in what is predicted from it: blame tells it from a fault
+elsewhere, and m grows to it.
 
 Of rows with missing or other broken numbers, each reason is a cause, and its channels are those numbers. Surprise in
 the rows that follow comes from the gap and belongs to it. The sign of an incident is noted and divides none: the error
@@ -19,20 +22,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import SURPRISING, blamed, reason
+from asm_gym.data.alarm_reasons import SURPRISING, reason
 from asm_gym.detection.alarm_rule import MINUTE, alarms_in, rows_over
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 SharesOf = Callable[[int], Numbers]
+Blamed = tuple[int, ...]  # columns that explain a row together, the likeliest first
 
 SETTLING_S = 2.0  # in which an incident spreads over the channels it touches [s]
+SPREADING_S = 20.0  # in which its strength elsewhere is learned: about a round of work [s]
 SPREAD = 2.0  # a channel of no incident may be as strong as this times those that were added
 FADING_S = 10.0  # in which surprise fades once the cause is acknowledged [s]
 TOUCHED = 0.5  # least strength of a channel that an incident touches, in thresholds
@@ -52,6 +58,7 @@ class Incident:
     settled: float = 0.0  # until then it spreads [s]
     gap: float = -math.inf  # its latest row with numbers that are missing or not finite [s]
     snoozed: float | None = None  # until then it stays open, whatever comes [s]
+    blamed: Blamed = ()  # by its first row, or the strongest channel; empty of missing numbers
 
     def is_open(self, time: float) -> bool:
         """Return whether a row at this time [s] may still belong to it."""
@@ -92,12 +99,18 @@ class AlarmRow:
     surprise: float
     threshold: float
     follows: bool = False  # the row before was in alarm too
-    column: int | None = None  # that blame points to; None where it was not asked
+    blame: Callable[[], Blamed] | None = None  # asked where it matters, as it takes milliseconds
 
     @property
     def excess(self) -> float:
         """Surprise, in thresholds."""
         return float(self.surprise / self.threshold)
+
+    def blamed(self) -> Blamed:
+        """Return what blame points to; empty where it cannot be asked."""
+        if self.blame is None:
+            return ()
+        return self.blame()
 
 
 class IncidentBook:
@@ -136,11 +149,16 @@ class IncidentBook:
         known = np.logical_or.reduce([i.known for i in surprising])
         settling = [i for i in surprising if i.settles(row.time)]
         rest = np.where(known, 0.0, strengths)
+        owner = max(surprising, key=lambda i: self._strength_in(i, strengths))
         allowed = max(1.0, *(SPREAD * i.spread for i in surprising))
         if not settling and pooled(rest, self._power) > allowed:
-            return self._open_elsewhere(row, rest, known)
+            columns = row.blamed()
+            if not columns or not known[list(columns)].all():
+                return self._open_elsewhere(row, rest, known, columns)
+            owner.spread = float(rest.max())
+        elif row.time <= owner.start + SPREADING_S:
+            owner.spread = max(owner.spread, float(rest.max()))
 
-        owner = max(surprising, key=lambda i: self._strength_in(i, strengths))
         if settling:
             settling[-1].add_channels(strengths, known)
         self._prolong(surprising, owner, row, strengths)
@@ -187,18 +205,22 @@ class IncidentBook:
 
     def _open_first(self, row: AlarmRow, strengths: Floats) -> Incident:
         """Open an incident by a row of these strengths (D,), where no other surprises."""
-        column = row.column
-        if column is None:
-            column = blamed(row.numbers, row.shares)
-        return self._open_by(row, SURPRISING, column, strengths > TOUCHED)
+        columns = row.blamed() or (int(np.argmax(strengths)),)
+        opened = self._open_by(row, SURPRISING, columns[0], strengths > TOUCHED)
+        opened.blamed = columns
+        return opened
 
-    def _open_elsewhere(self, row: AlarmRow, rest: Floats, known: Mask) -> Incident:
+    def _open_elsewhere(
+        self, row: AlarmRow, rest: Floats, known: Mask, columns: Blamed
+    ) -> Incident:
         """Open an incident by the strengths (D,) of a row that are in none of the ``known`` channels (D,)."""
         touched = (rest > TOUCHED) | (rest == rest.max())
-        column = row.column
-        if column is None or known[column]:
-            column = int(np.argmax(rest))
-        return self._open_by(row, SURPRISING, column, touched)
+        new = tuple(column for column in columns if not known[column])
+        if not new:
+            new = (int(np.argmax(rest)),)
+        opened = self._open_by(row, SURPRISING, new[0], touched)
+        opened.blamed = new
+        return opened
 
     def _prolong(
         self, incidents: list[Incident], owner: Incident, row: AlarmRow, strengths: Floats
@@ -265,7 +287,7 @@ def rows_of_alarm(
     stream: Numbers | None,
     threshold: float,
     dt: float,
-    blame_of: Callable[[int], int | None] = lambda row: None,
+    blame_of: Callable[[int], Blamed] | None = None,
 ) -> Iterator[AlarmRow]:
     """Yield the rows in alarm of an episode.
 
@@ -275,11 +297,14 @@ def rows_of_alarm(
         stream: (T, D) as it was sensed. Without it, numbers whose shares are not finite are missing.
         threshold: of surprise.
         dt: period of the rows [s].
-        blame_of: returns the column that blame points to in a row; None where it was not asked.
+        blame_of: returns what blame points to in a row, by its index; None where it cannot be asked.
     """
     over = rows_over(surprise, threshold)
     for index in np.flatnonzero(over).tolist():
         shares = np.asarray(shares_of(index), np.float64)
+        blame = None
+        if blame_of is not None:
+            blame = partial(blame_of, index)
         if stream is None:
             numbers: Numbers = np.where(np.isfinite(shares), 0.0, np.nan)
         else:
@@ -291,7 +316,7 @@ def rows_of_alarm(
             surprise=float(surprise[index]),
             threshold=threshold,
             follows=bool(index and over[index - 1]),
-            column=blame_of(index),
+            blame=blame,
         )
 
 

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFormatter
 from numpy.typing import NDArray
 
 from asm_gym.data.clock import date_of
@@ -53,6 +53,9 @@ _LINES: tuple[Any, ...] = (
 )
 MOST_POINTS = 4000  # of a curve
 MOST_SPANS = 1000  # of time that are told apart
+MOST_TIMES = 6  # of day under an axis
+ROUND_STEPS_S = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 14_400, 21_600, 43_200)
+DAY_S = 86_400
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _ALARM_BAR: dict[str, Any] = {
     "color": VERMILLION,
@@ -239,9 +242,18 @@ def _label_times(panels: Sequence[Axes], traces: Sequence[ScoredEpisode]) -> Non
     for ax, trace in zip(panels, traces, strict=True):
         if date_of(_start(trace)):
             ax.xaxis.set_major_formatter(FuncFormatter(lambda stamp, _: date_of(stamp)[11:19]))
-            ax.xaxis.set_major_locator(MaxNLocator(6))
+            ax.xaxis.set_major_locator(MultipleLocator(_round_step(*ax.get_xlim())))
             label = "time of day (UTC)"
     panels[-1].set_xlabel(label)
+
+
+def _round_step(first: float, last: float) -> float:
+    """Return the step of at most ``MOST_TIMES`` times of day between two stamps [s]."""
+    least = (last - first) / MOST_TIMES
+    for step in ROUND_STEPS_S:
+        if step >= least:
+            return step
+    return DAY_S * math.ceil(least / DAY_S)
 
 
 def _thinned(times: Floats, values: Floats) -> tuple[Floats, Floats]:

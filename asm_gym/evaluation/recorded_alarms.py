@@ -6,12 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import SURPRISING, blamed, thresholds_shown
+from asm_gym.data.alarm_reasons import SURPRISING, thresholds_shown
 from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.episode import Episode
@@ -24,7 +25,7 @@ from asm_gym.evaluation.incident_window import AFTER_S, BEFORE_S, AlarmMoment, I
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import named_causes
-from asm_gym.monitors.blame import blamed_columns, reattribute_alarms
+from asm_gym.monitors.blame import REMEMBERED
 from asm_gym.monitors.expectation import (
     Expectation,
     Expected,
@@ -38,6 +39,11 @@ HEADINGS = (
     *("log", "from [s]", "to [s]", "channel", "why", "thresholds", "date"),
     *("sensed", "expected", "±", "unit", "rows around it", "cause", "what to do"),
 )
+TO_READ = (
+    *("from", "to", "log", "what happened", "what to do", "channel", "sensed", "expected"),
+    *("thresholds", "rows around it"),
+)
+"""Headings of the alarms in a report."""
 Floats = NDArray[np.float64]
 MOST_NAMED = 3  # channels that the table of an hour names
 
@@ -60,6 +66,7 @@ class Alarm(NamedTuple):
     beside: Expected | None = None  # the channel in its first row beside what was expected
     evidence: str = ""  # file of the rows around it
     cause: str = ""  # in words; empty where none was looked for
+    cause_name: str = ""  # one of ``named_causes.REMEDIES``, likewise
     remedy: str = ""  # what to do about it
     moment: AlarmMoment | None = None  # the channel around its first row
 
@@ -77,18 +84,43 @@ class Alarm(NamedTuple):
             return date_of(self.start)
         return ""
 
+    def shown(self, time: float) -> str:
+        """Return a time of the log for a reader: the date, where its clock has one, else seconds."""
+        date = ""
+        if self.has_stamps:
+            date = date_of(time)
+        if date:
+            return f"{date[:10]} {date[11:23]}"
+        return f"{time:.3f} s"
+
     def in_words(self) -> str:
-        """Return what happened, in a sentence or two."""
-        where = f"{self.log}, {self.start:.3f} s: "
-        text = f"{self.channel or 'the whole row'}: {self.why}"
-        if self.why == SURPRISING:
+        """Return what happened, in some sentences."""
+        if self.why != SURPRISING:
+            text = f"{self.channel or 'the whole row'}: {self.why}"
+        elif self.beside is None:
             text = f"{self.channel} is not what the other numbers let expect"
-            if self.beside is not None:
-                text = self.beside.sentence(self.channel)
+        else:
+            text = self.beside.sentence(self.channel)
+        if self.why == SURPRISING:
             text += f" ({thresholds_shown(self.excess)} thresholds)"
         if self.cause:
-            text += f". Cause: {self.cause}; {self.remedy}"
-        return f"{where}{text}."
+            to_do = f"{self.remedy[:1].upper()}{self.remedy[1:]}"
+            text = f"{self.cause}. {text}. {to_do}"
+        return f"{self.log}, {self.shown(self.start)}: {text}."
+
+    def line(self) -> tuple[str, ...]:
+        """Format for a report, under ``TO_READ``."""
+        sensed = ""
+        expected = ""
+        if self.beside is not None:
+            unit = self.beside.unit
+            sensed = f"{self.beside.sensed:.4g} {unit}"
+            expected = f"{self.beside.expected:.4g} ± {self.beside.plus_minus:.2g} {unit}"
+        return (
+            *(self.shown(self.start), self.shown(self.end), self.log),
+            *(self.cause or self.why, self.remedy, self.channel, sensed, expected),
+            *(thresholds_shown(self.excess), self.evidence),
+        )
 
     def cells(self, to_read: bool = False) -> tuple[str, ...]:
         """Format for a table, under ``HEADINGS``; ``to_read`` caps the surprise."""
@@ -115,14 +147,6 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
     """
     assert trace.attribution is not None
     assert trace.stream is not None
-    begins = set(trace.alarms)
-
-    def blame_of(row: int) -> int | None:
-        """Return the column that blame points to, in the first row of surprise over its threshold."""
-        if row not in begins or trace.attribution is None or trace.stream is None:
-            return None
-        return blamed(trace.stream[row], trace.attribution[row])
-
     book = IncidentBook(trace.power)
     incidents = []  # they grow as long as rows follow
     for row in rows_of_alarm(
@@ -131,7 +155,7 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
         stream=trace.stream,
         threshold=trace.threshold,
         dt=trace.dt,
-        blame_of=blame_of,
+        blame_of=partial(blamed_in, trace),
     ):
         opened = book.follow(row)
         if opened is not None:
@@ -143,26 +167,38 @@ def alarms_of(trace: ScoredEpisode, expectation: Expectation | None = None) -> l
             rows = trace.stream[max(alarm.row - 1, 0) : alarm.row + 1]
             alarm = alarm._replace(beside=expectation.at_end(rows, incident.column))
         if incident.reason == SURPRISING and trace.namer is not None:
-            cause = cause_of(trace, alarm.row, trace.namer)
+            cause = cause_of(trace, incident, trace.namer)
             in_words = cause.in_words(trace.channels, trace.units)
-            alarm = alarm._replace(cause=in_words, remedy=cause.remedy)
+            alarm = alarm._replace(cause=in_words, cause_name=cause.name, remedy=cause.remedy)
         alarms.append(alarm)
     return alarms
 
 
-def cause_of(trace: ScoredEpisode, first: int, namer: CauseNamer) -> NamedCause:
-    """Return the cause of the alarm that was raised in a row."""
-    assert trace.attribution is not None
-    assert trace.stream is not None
+def blamed_in(trace: ScoredEpisode, row: int) -> tuple[int, ...]:
+    """Return what blame points to in a row; empty where the monitor cannot blame."""
+    if trace.blame is None or trace.recentred is None:
+        return ()
+    rows = trace.recentred[max(0, row + 1 - REMEMBERED) : row + 1]
+    return trace.blame(rows, trace.raw_shares(row))
+
+
+def cause_of(trace: ScoredEpisode, incident: Incident, namer: CauseNamer) -> NamedCause:
+    """Return the cause of an incident."""
+    assert trace.recentred is not None
+    first = _first_row(trace, incident)
     start = max(0, first - round(named_causes.BEFORE_S / trace.dt))
     stop = first + round(named_causes.AFTER_S / trace.dt) + 1
-    columns = blamed_columns(trace.attribution[first])
-    return namer(trace.stream[start:stop], first - start, columns)
+    return namer(trace.recentred[start:stop], first - start, incident.blamed)
+
+
+def _first_row(trace: ScoredEpisode, incident: Incident) -> int:
+    """Return the index of the first row of an incident."""
+    return round(incident.start / trace.dt) - 1
 
 
 def _alarm(trace: ScoredEpisode, incident: Incident) -> Alarm:
     """Return an incident as an alarm of a recording."""
-    first = round(incident.start / trace.dt) - 1
+    first = _first_row(trace, incident)
     last = round(incident.last / trace.dt) - 1
     alarm = Alarm(
         log=trace.kind,
@@ -204,22 +240,20 @@ def by_hour(alarms: Sequence[Alarm], hours: float) -> Table:
         alarms: of recordings.
         hours: duration of all recordings [h].
     """
-    counts: dict[tuple[str, int], Counter[str]] = {}
-    for alarm in alarms:
-        unit = "hour of the log"
-        hour = int(alarm.start // 3600)
+    counts: dict[str, Counter[str]] = {}
+    for alarm in sorted(alarms, key=lambda each: each.start):
+        hour = f"hour {int(alarm.start // 3600)} of the log"
         if alarm.date:
-            unit = "hour of the day (UTC)"
-            hour = datetime.fromtimestamp(alarm.start, UTC).hour
-        counts.setdefault((unit, hour), Counter())[alarm.channel or alarm.why] += 1
+            hour = f"{datetime.fromtimestamp(alarm.start, UTC).hour:02d}:00 UTC"
+        counts.setdefault(hour, Counter())[alarm.channel or alarm.why] += 1
     rows = []
-    for (unit, hour), channels in sorted(counts.items()):
-        names = ", ".join(f"{name} {count}" for name, count in channels.most_common(MOST_NAMED))
-        rows.append((f"{hour:02d}", unit, str(channels.total()), names))
+    for hour, channels in counts.items():
+        names = ", ".join(f"{count} {name}" for name, count in channels.most_common(MOST_NAMED))
+        rows.append((hour, str(channels.total()), names))
     caption = f"Alarms by hour: {len(alarms)} in {hours:.3g} hours"
     if hours > 0:
         caption += f", {len(alarms) / hours:.3g} an hour"
-    return Table(caption, ("from", "hour", "alarms", "channels"), rows)
+    return Table(caption, ("from", "alarms", "channels"), rows)
 
 
 def sensed_peak(trace: ScoredEpisode) -> float:
@@ -233,11 +267,12 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
     about = getattr(monitor, "about", {})
     names = LogSchema.kept_in(about, monitor.spec).names_in_logs
     shift = shift_of_columns(monitor.spec, shifts_kept_in(about))
-    surprises = monitor.score_episodes([recentred(log.episode, shift) for log in logs])
+    as_judged = [recentred(log.episode, shift) for log in logs]
+    surprises = monitor.score_episodes(as_judged)
     blame = getattr(monitor, "blame_", None)
     namer = getattr(monitor, "cause_namer_", None)
     traces = []
-    for (name, episode), surprise in zip(logs, surprises, strict=True):
+    for (name, episode), as_scored, surprise in zip(logs, as_judged, surprises, strict=True):
         fault = episode.faults
         if len(fault) != len(episode):
             fault = np.zeros(len(episode), np.bool_)
@@ -257,11 +292,11 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
             stream=episode.stream,
             origin=episode.info.get(LOG_ORIGIN),
             namer=namer,
+            blame=blame,
+            recentred=as_scored.stream,
             units=monitor.spec.units,
         )
-        before_blame = {row: judged.attribution[row].copy() for row in trace.alarms}
-        reattribute_alarms(blame, episode.stream, trace.alarms, judged.attribution)
-        traces.append(replace(trace, strong_shares=before_blame))
+        traces.append(trace)
     return traces
 
 
@@ -279,12 +314,10 @@ def followed(trace: ScoredEpisode, following: FollowingThreshold) -> ScoredEpiso
     factor = np.ones(len(trace))
     usual = np.isfinite(relative) & (trace.surprise > 0)
     np.divide(relative, trace.surprise, out=factor, where=usual)
-    strong_shares = {row: shares * factor[row] for row, shares in trace.strong_shares.items()}
     return replace(
         trace,
         surprise=relative,
         attribution=trace.attribution * factor[:, None],
-        strong_shares=strong_shares,
         top_channel="",
     )
 

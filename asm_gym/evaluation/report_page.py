@@ -31,6 +31,8 @@ from asm_gym.files import write_text, written_whole
 COPIED = ("task", "monitor", "kind", "severity", "seed", "onset")
 """Columns of ``results.parquet`` that are fields of a scored episode."""
 
+FEWEST_SPACES = 3  # between the words of a sentence
+
 _LINKED = re.compile(r"^(incidents/[0-9]+\.csv)$")  # files beside a report
 _LINK = r'<a href="\1">\1</a>'
 
@@ -89,12 +91,20 @@ def _table(table: Table) -> str:
     for row in table.rows:
         name, *cells = (_LINKED.sub(_LINK, escape(str(cell))) for cell in row)
         named = zip(headings[1:], cells, strict=True)
-        values = "".join(f'<td data-name="{heading}">{cell}</td>' for heading, cell in named)
+        values = "".join(_cell(heading, cell) for heading, cell in named)
         lines.append(f"<th>{name}</th>{values}")
     head, *body = (f"<tr>{line}</tr>\n" for line in lines)
     caption = f"<caption>{escape(table.caption)}</caption>"
     content = f"<thead>{head}</thead>\n<tbody>{''.join(body)}</tbody>"
     return f'<div class="scroll"><table>{caption}\n{content}</table></div>'
+
+
+def _cell(heading: str, text: str) -> str:
+    """Return a cell, both texts being HTML; sentences may break, numbers and names may not."""
+    kind = ""
+    if text.count(" ") >= FEWEST_SPACES and "±" not in text:
+        kind = ' class="text"'
+    return f'<td{kind} data-name="{heading}">{text}</td>'
 
 
 def _figure(caption: str, figure: Figure) -> str:

@@ -16,6 +16,7 @@ from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.detection.contact_limits import LEANS_S
 from asm_gym.detection.incidents import incidents_in
 from asm_gym.evaluation.defaults import TRANSIENT
+from asm_gym.monitors.blame import Blame
 from asm_gym.monitors.named_causes import CauseNamer
 from asm_gym.readings import spans
 
@@ -79,6 +80,9 @@ class ScoredEpisode:
     strong_shares: Mapping[int, Floats] = field(default_factory=dict)
     units: tuple[str, ...] = ()  # of the channels
     namer: CauseNamer | None = None  # of the causes of alarms
+    blame: Blame | None = None  # of the rows in alarm
+    # (T, D) the stream without level shifts that were acknowledged, as it was judged
+    recentred: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):

@@ -54,6 +54,10 @@ class Acknowledgements:
         if self._is_shifted:
             rows -= self._offset.astype(np.float32)
 
+    def recentred(self, robot: int, row: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a row (D,) of a robot without its level shifts."""
+        return row - self._offset[robot]
+
     def note_alarms(self, over: NDArray[np.bool_], attribution: NDArray[np.float64]) -> None:
         """Note which robots (n,) are in alarm, and the shares (n, D) of their channels."""
         self._alarm_row[over] = self._row

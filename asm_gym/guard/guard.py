@@ -232,6 +232,10 @@ class Guard:
         LOG.info("acknowledged: %s", shift)
         return shift
 
+    def recentred(self, row: NDArray[np.float64], robot: int = 0) -> NDArray[np.float64]:
+        """Return a row (D,) as it is judged: without the level shifts that were acknowledged."""
+        return self._acknowledgements.recentred(robot, row)
+
     def keep(self, path: str | Path, robot: int = 0) -> None:
         """Write the memory with the level shifts of a robot that were acknowledged, in a note."""
         self._acknowledgements.save(path, robot)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors.blame import blamed_columns
 from asm_gym.monitors.named_causes import (
     AFTER_S,
     BEFORE_S,
@@ -43,10 +42,10 @@ class LiveCauses:
         self._since = -1  # rows since the alarm; negative where no cause is looked for
         self._blamed: tuple[int, ...] = ()
 
-    def open(self, shares: NDArray[np.float64]) -> None:
-        """Look for the cause of the alarm in the newest row, by the shares (D,) of its numbers."""
+    def open(self, blamed: tuple[int, ...]) -> None:
+        """Look for the cause of the alarm in the newest row, of which blame points to these columns."""
         self._since = 0
-        self._blamed = blamed_columns(shares)
+        self._blamed = blamed
 
     def follow(self, row: NDArray[Any]) -> NamedCause | None:
         """Take up the next row (D,); return the cause once it is clear, or nothing can be found."""

@@ -13,13 +13,14 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.alarm_reasons import LATE, SURPRISING, blamed, thresholds_shown
+from asm_gym.data.alarm_reasons import LATE, SURPRISING, thresholds_shown
 from asm_gym.data.bridging import Bridge
 from asm_gym.data.live_rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
@@ -266,7 +267,7 @@ class LiveWatch(Adapter):
     def report_step(self, reports: Sequence[RowReport], target: Row) -> None:
         """Say alarms and events of the row that the reports are of."""
         for report in reports:
-            cause = self._causes.follow(target.numbers)
+            cause = self._causes.follow(self._guard.recentred(target.numbers))
             if cause is not None:
                 text = f"cause: {cause.in_words(self._names, self._spec.units)}; {cause.remedy}"
                 self._note(text, cause=cause.name, remedy=cause.remedy)
@@ -277,25 +278,26 @@ class LiveWatch(Adapter):
     def _report_surprise(self, report: RowReport, numbers: NDArray[np.float64]) -> None:
         """Raise an alarm where surprise over its threshold opens an incident."""
         robot = report.robots[0]
-        shares = self._blame.shares(numbers, bool(robot["over"]), report.attribution[0])
+        self._blame.add(self._guard.recentred(numbers))
         follows = self._was_over
         self._was_over = bool(robot["over"])
         if not self._was_over:
             return
+        shares = report.attribution[0]
         row = AlarmRow(
             time=self._now,
             numbers=numbers,
-            shares=report.attribution[0],
+            shares=shares,
             surprise=float(robot["surprise"]),
             threshold=float(robot["threshold"]),
             follows=follows,
-            column=None if follows else blamed(numbers, shares),
+            blame=partial(self._blame.columns, shares),
         )
         incident = self._book.follow(row)
         if incident is not None:
             self._alarm_surprise(incident, numbers)
             if incident.reason == SURPRISING:
-                self._causes.open(shares)
+                self._causes.open(incident.blamed)
 
     def _alarm_surprise(self, incident: Incident, numbers: NDArray[np.float64]) -> None:
         """Raise the alarm of an incident that a row opens."""

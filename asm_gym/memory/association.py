@@ -27,7 +27,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, activate, inner_kernel, kernel, outward
+from asm_gym.memory.energy import (
+    MOST_IN_ORDER,
+    Array,
+    activate,
+    inner_kernel,
+    kernel,
+    outward,
+)
 from asm_gym.scaling import ScaledRows, StreamScaler
 
 Ints = NDArray[np.intp]
@@ -184,15 +191,14 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
 
 @inner_kernel
 def complete_by_spans(f: Array, a: Array, U: Array, D: Array, spans: Ints) -> Array:
-    """Return Δ̂ (B, X) as ``complete`` does; of a single row only synapses that exist are read."""
-    if a.shape[0] > 1:
-        return complete(f, a, U, D)
+    """Return Δ̂ (B, X) as ``complete`` does; only synapses that exist are read."""
     out = outward(a, D)
     for i in range(U.shape[0]):
-        total = np.float32(0)
-        for j in range(spans[i, 0], spans[i, 1]):
-            total += f[0, j] * U[i, j]
-        out[0, i] += total
+        for n in range(a.shape[0]):
+            total = np.float32(0)
+            for j in range(spans[i, 0], spans[i, 1]):
+                total += f[n, j] * U[i, j]
+            out[n, i] += total
     return out
 
 
@@ -219,15 +225,15 @@ def whiten(a: Array, R: Array, order: Ints) -> Array:
     for n in range(a.shape[0]):  # numba takes seconds to compile an assignment to a slice
         for i in range(a.shape[1]):
             b[n, i] = a[n, order[i]]
-    if a.shape[0] > 1:
+    if a.shape[0] > MOST_IN_ORDER:
         np.dot(b, R.T, z)
         return z
-    # Each weight is read once, and no zeros.
-    for i in range(a.shape[1]):
-        total = np.float32(0)
-        for j in range(i + 1):
-            total += R[i, j] * b[0, j]
-        z[0, i] = total
+    for i in range(a.shape[1]):  # no zeros of R are read
+        for n in range(a.shape[0]):
+            total = np.float32(0)
+            for j in range(i + 1):
+                total += R[i, j] * b[n, j]
+            z[n, i] = total
     return z
 
 

@@ -28,6 +28,7 @@ Scalar = float | np.floating[Any]
 
 STEEPEST = np.float32(0.77)  # above the largest |f''|, which is 4 / (3√3) for tanh
 STRIDE = np.float32(1.5)  # step of inference times the curvature; inference diverges from 2 on
+MOST_IN_ORDER = 64  # rows of a batch that are summed one by one; more come to learn from
 STILL = np.float32(1e-8)  # inference ends when no unit moves further in a step
 
 
@@ -80,28 +81,35 @@ def activate(z: Array) -> Array:
 
 @kernel
 def outward(a: Array, W: Array) -> Array:
-    """Return a @ W.T, (B, P) from (B, Q), along the synapses ``W`` (P, Q); of a single row without BLAS, faster."""
-    out = np.empty((a.shape[0], W.shape[0]), a.dtype)
-    if a.shape[0] > 1:
+    """Return a @ W.T, (B, P) from (B, Q), along the synapses ``W`` (P, Q).
+
+    Up to ``MOST_IN_ORDER`` rows are each summed in one order, so that no row depends on the others. BLAS, for more,
+    sums in an order of the whole batch, and an error of prediction is a small difference of large sums.
+    """
+    rows = a.shape[0]
+    out = np.empty((rows, W.shape[0]), a.dtype)
+    if rows > MOST_IN_ORDER:
         np.dot(a, W.T, out)
         return out
     whole = W.shape[0] - W.shape[0] % 4
     for i in range(0, whole, 4):
-        p = q = r = s = np.float32(0)
-        for j in range(W.shape[1]):
-            p += a[0, j] * W[i, j]
-            q += a[0, j] * W[i + 1, j]
-            r += a[0, j] * W[i + 2, j]
-            s += a[0, j] * W[i + 3, j]
-        out[0, i] = p
-        out[0, i + 1] = q
-        out[0, i + 2] = r
-        out[0, i + 3] = s
+        for n in range(rows):
+            p = q = r = s = np.float32(0)
+            for j in range(W.shape[1]):
+                p += a[n, j] * W[i, j]
+                q += a[n, j] * W[i + 1, j]
+                r += a[n, j] * W[i + 2, j]
+                s += a[n, j] * W[i + 3, j]
+            out[n, i] = p
+            out[n, i + 1] = q
+            out[n, i + 2] = r
+            out[n, i + 3] = s
     for i in range(whole, W.shape[0]):
-        total = np.float32(0)
-        for j in range(W.shape[1]):
-            total += a[0, j] * W[i, j]
-        out[0, i] = total
+        for n in range(rows):
+            total = np.float32(0)
+            for j in range(W.shape[1]):
+                total += a[n, j] * W[i, j]
+            out[n, i] = total
     return out
 
 

@@ -266,6 +266,16 @@ class FollowedBlame:
         self._rows: deque[Row] = deque(maxlen=REMEMBERED)
         self._was_alarm = False
 
+    def add(self, row: Row) -> None:
+        """Take up the next row (D,)."""
+        self._rows.append(row)
+
+    def columns(self, shares: Floats) -> tuple[int, ...]:
+        """Return what blame points to in the newest row, by the shares (D,) of its numbers; empty without blame."""
+        if self._blame is None:
+            return ()
+        return self._blame(np.array(self._rows), shares)
+
     def shares(self, row: Row, alarm: bool, shares: Floats) -> Floats:
         """Return the shares (D,) of a row's numbers in its surprise, by blame in the first row of an alarm.
 
@@ -274,12 +284,12 @@ class FollowedBlame:
             alarm: whether it is in alarm.
             shares: (D,) by the monitor.
         """
-        self._rows.append(row)
+        self.add(row)
         is_first = alarm and not self._was_alarm
         self._was_alarm = alarm
-        if self._blame is None or not is_first:
+        if not is_first:
             return shares
-        return reattributed(shares, self._blame(np.array(self._rows), shares))
+        return reattributed(shares, self.columns(shares))
 
 
 def reattributed(shares: Floats, blamed: Sequence[int]) -> Floats:
@@ -290,32 +300,3 @@ def reattributed(shares: Floats, blamed: Sequence[int]) -> Floats:
     new = np.zeros_like(shares)
     new[list(blamed)] = shares.sum() * weights / weights.sum()
     return new
-
-
-def reattribute_alarms(
-    blame: Blame | None, stream: Rows, alarms: Sequence[int], shares: Any
-) -> None:
-    """Write shares by blame of the rows at which alarms are raised.
-
-    Args:
-        blame: of the monitor; None leaves the shares as they are.
-        stream: (T, D) of an episode.
-        alarms: those rows.
-        shares: (T, D) of the numbers in the surprise of each row, written.
-    """
-    if blame is None:
-        return
-    for row in alarms:
-        rows = stream[max(0, row + 1 - REMEMBERED) : row + 1]
-        shares[row] = reattributed(shares[row], blame(rows, shares[row]))
-
-
-def blamed_columns(shares: Row) -> tuple[int, ...]:
-    """Return the columns that shares (D,) of ``reattributed`` blame, the first alone where they are of all columns."""
-    if not np.isfinite(shares).all():
-        return ()
-    order = np.argsort(-shares, kind="stable")
-    count = int((shares > 0).sum())
-    if count > MOST_BLAMED:
-        count = 1
-    return tuple(order[:count].tolist())

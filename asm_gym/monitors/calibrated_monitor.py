@@ -31,7 +31,7 @@ from asm_gym.monitors.calibration import (
     with_ceilings,
 )
 from asm_gym.monitors.monitor_files import read_monitor, threshold_below, write_monitor
-from asm_gym.monitors.monitor_protocol import Progress, Surprise
+from asm_gym.monitors.monitor_protocol import Progress, State, Surprise
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows, surprise_of_stream
 from asm_gym.monitors.robot_limits import MARGIN, RobotLimits, limits_of
 from asm_gym.monitors.stream_model import (
@@ -367,14 +367,20 @@ class CalibratedMonitor:
         self._require_fitted()
         rows = checked_rows(state, stream, self.spec)
         model, output = self.model.predict(state.model, rows)
-        detection, attribution = self.detection.attribute_step(
-            state.detection, output, rows, lambda shares: shares @ self._error_shares
+        detection, surprise = self.judge(state.detection, output, rows)
+        return MonitorState(model, detection), surprise
+
+    def judge(
+        self, state: State, output: ModelOutput, rows: NDArray[Any]
+    ) -> tuple[State, Surprise]:
+        """Return the new state of the detection, and the surprise of rows (B, D) by the model's output for them."""
+        state, attribution = self.detection.attribute_step(
+            state, output, rows, lambda shares: shares @ self._error_shares
         )
         is_finite = np.isfinite(rows)
         incomplete = ~is_finite.all(axis=1)
         attribution[incomplete] = np.where(is_finite[incomplete], 0.0, np.inf)
-        value = attribution.sum(axis=1)
-        return MonitorState(model, detection), Surprise(value, attribution)
+        return state, Surprise(attribution.sum(axis=1), attribution)
 
     @typed
     def reset_evidence(self, state: MonitorState) -> MonitorState:

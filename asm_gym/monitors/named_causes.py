@@ -4,9 +4,9 @@ frozen        a channel repeats its reading for longer than any learned
 wrapped       one position is wrong by whole turns
 offset        one channel alone is wrong, by the same amount all the time
 another home  several positions are wrong, at places where no healthy episode was
-payload       several torques are wrong, and keep it up; nothing else is
 standstill    nothing moves for longer than in any healthy episode
 pace          the path is known, and passed faster or slower
+payload       several torques are wrong, and keep it up; nothing else is
 unexplained   none of these
 """
 
@@ -46,6 +46,18 @@ REMEDIES = {
 }
 """What to do about each cause."""
 
+WORDS = {
+    FROZEN: "{channel} is frozen",
+    WRAPPED: "{channel} is wrapped by {size}",
+    OFFSET: "{channel} is offset by {size}",
+    HOME: "the arm has another home",
+    PAYLOAD: "the hand carries another payload",
+    STANDSTILL: "the arm stands still",
+    PACE: "the pace is {size} of what was learned",
+    UNEXPLAINED: "unexplained, in {channel}",
+}
+"""Each cause in a sentence."""
+
 BEFORE_S = 1.0  # rows before an alarm that its cause is named by [s]
 AFTER_S = 5.0  # rows from its first row on [s]
 SHORTEST_S = 0.5  # least time after which any cause is named [s]
@@ -74,17 +86,13 @@ class NamedCause(NamedTuple):
 
     def in_words(self, names: Sequence[str], units: Sequence[str] = ()) -> str:
         """Return the cause with its size, for columns with such names and units."""
-        text = self.name
-        if self.name == PACE:
-            return f"{text} of {self.size:.2f}"
-        if self.column is not None:
-            text += f" of {names[self.column]}"
-        if np.isfinite(self.size):
-            unit = ""
-            if len(units) and self.column is not None and units[self.column] != "1":
-                unit = f" {units[self.column]}"
-            text += f" by {self.size:+.3g}{unit}"
-        return text
+        if self.column is None:
+            return WORDS[self.name].format(channel="the whole robot", size=f"{self.size:.2f}")
+        unit = ""
+        if len(units) and units[self.column] != "1":
+            unit = f" {units[self.column]}"
+        size = f"{self.size:+.3g}{unit}"
+        return WORDS[self.name].format(channel=names[self.column], size=size)
 
 
 class CauseNamer:
@@ -125,8 +133,8 @@ class CauseNamer:
         return (
             self._of_one_channel(rows, first, blamed)
             or self._of_place(since)
-            or self._of_load(rows, first, blamed)
             or self._of_pace(since)
+            or self._of_load(rows, first, blamed)
             or unexplained
         )
 

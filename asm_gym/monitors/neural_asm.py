@@ -26,6 +26,7 @@ from asm_gym.monitors.blame import Blame
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
+from asm_gym.monitors.kernel_streams import observe_streams
 from asm_gym.monitors.memory_config import (
     ASSOCIATION_UNITS,
     EPOCHS,
@@ -40,7 +41,7 @@ from asm_gym.monitors.monitor_state import MonitorState, checked_rows
 from asm_gym.monitors.named_causes import CauseNamer
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
-from asm_gym.monitors.stream_model import made, parameter_names
+from asm_gym.monitors.stream_model import groups_side_by_side, made, parameter_names
 from asm_gym.monitors.torque.arm_features import (
     ArmFeatures,
     judged_by_values,
@@ -267,6 +268,24 @@ class NeuralASM(CalibratedMonitor):
             likeliest = new.model.skill.argmax(axis=1)
             surprise = surprise._replace(skill=np.array(self.skills_)[likeliest])
         return new, surprise
+
+    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        kernel = self._row_kernel()
+        if kernel is None or self.skills_:
+            return super().score_episodes(episodes)
+        self._require_fitted()
+        for episode in episodes:
+            self.spec.require(episode.spec, "the episode")
+        scores: dict[int, Surprise] = {}
+        for group in groups_side_by_side(episodes):
+            streams = [episodes[index].stream for index in group]
+            found = observe_streams(kernel, self.initial_state(len(group)), streams)
+            for index, (surprise, divisor) in zip(group, found, strict=True):
+                scores[index] = surprise
+                if self.values_ is not None:
+                    joined = self.values_.join_episode(episodes[index], surprise, divisor)
+                    scores[index] = joined
+        return [scores[index] for index in range(len(episodes))]
 
     def compiled_row(self) -> RowKernel | None:
         """Return the kernel that does all that ``observe`` does; None where Python takes part in a row."""

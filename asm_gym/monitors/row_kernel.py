@@ -150,11 +150,14 @@ class RowKernel:
         with one_thread_for(len(rows)):
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
+        return out, self.surprise(judged, attribution), judged["divisor"].copy()
+
+    def surprise(self, judged: Any, attribution: NDArray[np.float64]) -> Surprise:
+        """Return the surprise of rows (N,) of ``JUDGED``, with their attribution (N, D)."""
         surprise = Surprise(judged["surprise"].copy(), attribution)
-        if self._has_events:
-            raw = judged["raw_surprise"].copy()
-            surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
-        return out, surprise, judged["divisor"].copy()
+        if not self._has_events:
+            return surprise
+        return surprise._replace(raw=judged["raw_surprise"].copy(), excuse=judged["excuse"].copy())
 
 
 def expected_errors(

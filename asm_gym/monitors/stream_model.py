@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from asm_gym.monitors.monitor_protocol import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
+STRETCH_ROWS = 4096  # rows of an episode that are computed at once
 SIDE_BY_SIDE = 64  # episodes that run together; with more the arrays no longer fit the cache
 
 
@@ -130,6 +131,28 @@ def read_next(
     return history.followed_by(rows), reading, known
 
 
+class Stretch(NamedTuple):
+    """Consecutive rows of one stream, after some that came before them."""
+
+    rows: slice  # of the stream
+    lead: int  # rows that came before
+    reading: ScaledRows  # of all
+    known: NDArray[np.float32]  # (N, 1) of all, as of ``read_next``
+
+
+def stretches(
+    senses: StreamScaler, stream: NDArray[np.floating[Any]], past: int
+) -> Iterator[Stretch]:
+    """Read all rows of a stream (T, D), as ``read_next`` does one after another, each with ``past`` rows before it."""
+    for start in range(0, len(stream), STRETCH_ROWS):
+        rows = slice(start, start + STRETCH_ROWS)
+        lead = min(start, past)
+        reading = senses.read_episode(stream[start - lead : rows.stop])
+        known = reading.whole.copy()
+        known[: senses.lag] = 0.0
+        yield Stretch(rows, lead, reading, known)
+
+
 def zero_unless_finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return values with 0 for those that are not finite."""
     return np.where(np.isfinite(values), values, 0.0)
@@ -216,9 +239,7 @@ def side_by_side(
 
     Yields, for each group of episodes, their indices and what ``advance`` returned beside the state in each step.
     """
-    longest_first = sorted(range(len(episodes)), key=lambda index: -len(episodes[index]))
-    for first in range(0, len(episodes), SIDE_BY_SIDE):
-        group = longest_first[first : first + SIDE_BY_SIDE]
+    for group in groups_side_by_side(episodes):
         streams = [episodes[index].stream for index in group]
         state = start(len(group))
         steps = []
@@ -228,6 +249,13 @@ def side_by_side(
             state, step = advance(running, rows.astype(np.float64))
             steps.append(step)
         yield group, steps
+
+
+def groups_side_by_side(episodes: Sequence[Episode]) -> list[list[int]]:
+    """Return the indices of episodes that run together, the longest first."""
+    longest_first = sorted(range(len(episodes)), key=lambda index: -len(episodes[index]))
+    firsts = range(0, len(episodes), SIDE_BY_SIDE)
+    return [longest_first[first : first + SIDE_BY_SIDE] for first in firsts]
 
 
 def first_of(state: State, count: int) -> State:

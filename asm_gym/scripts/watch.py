@@ -35,7 +35,7 @@ from asm_gym.data.schema import LogSchema
 from asm_gym.detection.conformal import hourly_promise
 from asm_gym.detection.following_threshold import FollowingThreshold
 from asm_gym.evaluation import recorded_alarms
-from asm_gym.evaluation.recorded_alarms import HEADINGS
+from asm_gym.evaluation.recorded_alarms import HEADINGS, TO_READ
 from asm_gym.evaluation.tables import Table, plain_cell
 from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
@@ -168,8 +168,8 @@ def write_figures_and_report(args: Args, reviewed: Review) -> str:
     figures.save(stream, args.out / "stream.png")
     tables = [recorded_alarms.by_hour(reviewed.alarms, reviewed.hours)]
     if reviewed.alarms:
-        rows = [alarm.cells(to_read=True) for alarm in reviewed.alarms]
-        tables.append(Table("Alarms", HEADINGS, rows))
+        lines = [alarm.line() for alarm in reviewed.alarms]
+        tables.append(Table("Alarms", TO_READ, lines))
     cards = {
         alarm.in_words(): figures.alarm_figure(alarm.moment, alarm.channel)
         for alarm in reviewed.largest()

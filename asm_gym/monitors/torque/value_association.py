@@ -194,8 +194,27 @@ class ValueAssociation(ScaledModel):
         return AveragedErrors(super().start(batch), errors)
 
     def predict(self, state: AveragedErrors, rows: Floats) -> tuple[AveragedErrors, ModelOutput]:
-        learned = self.learned_
         history, reading, known = read_next(self.senses_, state.history, rows)
+        error = self._errors(reading, known)
+        errors = np.concatenate([state.errors[:, 1:], error[:, None]], axis=1)
+        return AveragedErrors(history, errors), self._output(errors.mean(axis=1))
+
+    def predict_stretch(self, reading: ScaledRows, known: NDArray[np.float32]) -> ModelOutput:
+        """Return what ``predict`` returns for T rows of one stream, in one piece.
+
+        Args:
+            reading: the rows.
+            known: (T, 1) of ``stretches``.
+        """
+        return self._output(running_mean(self._errors(reading, known), self.window))
+
+    def _output(self, means: Floats) -> ModelOutput:
+        """Return the errors for means (N, V) of the last rows."""
+        return ModelOutput(means / self.learned_["largest"], no_context(means))
+
+    def _errors(self, reading: ScaledRows, known: NDArray[np.float32]) -> Floats:
+        """Return r (N, V) of rows; 0 of those that are not ``known`` (N, 1)."""
+        learned = self.learned_
         scaled = self._regression_rows(reading)
         features = self._features(self._physical(scaled))
         standardised = (features - learned["derived_mean"]) / learned["derived_spread"]
@@ -203,10 +222,7 @@ class ValueAssociation(ScaledModel):
 
         expected = inputs @ learned["D"].T
         rest = scaled.values[:, self._judged] - expected
-        error = known * rest / self._widening(inputs)  # (B, V) r; 0 in the first rows
-        errors = np.concatenate([state.errors[:, 1:], error[:, None]], axis=1)
-        mean = errors.mean(axis=1) / learned["largest"]
-        return AveragedErrors(history, errors), ModelOutput(mean, no_context(rows))
+        return np.asarray(known * rest / self._widening(inputs))
 
     def judged(self, R2: Floats) -> Places:
         """Return which values are judged, by their cross-fitted R² (X,)."""

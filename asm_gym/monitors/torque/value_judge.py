@@ -19,21 +19,22 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.blas import ONE_THREAD
 from asm_gym.data.episode import Episode
-from asm_gym.detection import Blocks
+from asm_gym.detection import Blocks, ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.evidence import TINY
 from asm_gym.detection.scores import Largest
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.monitor_protocol import State, Surprise
-from asm_gym.monitors.stream_model import read_next, require_arrays
+from asm_gym.monitors.stream_model import read_next, require_arrays, stretches
 from asm_gym.monitors.torque.crossfitting import quadratic_form, regular_inverse
 from asm_gym.monitors.torque.value_association import (
     ALIKE_S,
     MOST_LEVERAGE_INPUTS,
     ValueAssociation,
 )
-from asm_gym.scaling import StreamScaler
+from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
@@ -162,6 +163,21 @@ class ValueJudge:
         """
         spread = self.spread(state, rows)
         new, values = self.monitor.observe(state, rows)
+        return new, self._joined(changes, values, spread, divisor)
+
+    def join_episode(self, episode: Episode, changes: Surprise, divisor: Floats) -> Surprise:
+        """Return what ``join`` returns for one row after another of an episode of T rows, ``divisor`` being (T,)."""
+        (values,) = self.monitor.score_episodes([episode])
+        spread = np.ones(len(episode))
+        if len(self.leverage):
+            for part in stretches(self._senses, episode.stream, 2 * self._senses.lag):
+                spread[part.rows] = self._spread(part.reading, part.known)[part.lead :]
+        return self._joined(changes, values, spread, divisor)
+
+    def _joined(
+        self, changes: Surprise, values: Surprise, spread: Floats, divisor: Floats
+    ) -> Surprise:
+        """Return the greater of the surprise of changes and of values, N rows each."""
         by_changes = changes.value / spread
         raw_by_values = self.balance * values.value**self.power
         by_values = raw_by_values / divisor
@@ -181,13 +197,17 @@ class ValueJudge:
         if changes.raw is not None:
             raw = np.maximum(changes.raw / spread, raw_by_values)
             joined = joined._replace(raw=raw)
-        return new, joined
+        return joined
 
     def spread(self, state: State, rows: Floats) -> Floats:
         """Return √f (B,) of the next rows (B, D)."""
-        if not len(self.leverage):
-            return np.ones(len(rows))
         _, reading, known = read_next(self._senses, state.model.history, rows)
+        return self._spread(reading, known)
+
+    def _spread(self, reading: ScaledRows, known: NDArray[np.float32]) -> Floats:
+        """Return √f (N,) of rows; 1 of those that are not ``known`` (N, 1)."""
+        if not len(self.leverage):
+            return np.ones(len(known))
         leverage = quadratic_form(_with_one(reading.inputs), self.leverage)
         f = np.maximum(1.0, self.usual + leverage)
         return np.sqrt(np.where(known[:, 0] > 0, f, 1.0))
@@ -202,8 +222,28 @@ def without_values(arrays: Arrays) -> Arrays:
     return {name: array for name, array in arrays.items() if not name.startswith(PREFIX)}
 
 
+class _ValueMonitor(CalibratedMonitor):
+    """Scores whole episodes at once: no row depends on more than the last few."""
+
+    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        with ONE_THREAD:
+            return [self._scored(episode.stream) for episode in episodes]
+
+    def _scored(self, stream: NDArray[np.float32]) -> Surprise:
+        """Return the surprise of an episode (T, D)."""
+        model = _model(self)
+        found = Surprise(np.zeros(len(stream)), np.zeros(stream.shape))
+        for part in stretches(model.senses_, stream, 2 * model.lag + model.window):
+            output = model.predict_stretch(part.reading, part.known)
+            own = ModelOutput(output.errors[part.lead :], output.contexts[part.lead :])
+            _, surprise = self.judge((), own, stream[part.rows])
+            found.value[part.rows] = surprise.value
+            found.attribution[part.rows] = surprise.attribution
+        return found
+
+
 def _monitor(spec: StreamSpec, seed: int, urdf: str) -> CalibratedMonitor:
-    return CalibratedMonitor(ValueAssociation(spec, urdf=urdf), Largest(spec), seed=seed)
+    return _ValueMonitor(ValueAssociation(spec, urdf=urdf), Largest(spec), seed=seed)
 
 
 def _model(monitor: CalibratedMonitor) -> ValueAssociation:

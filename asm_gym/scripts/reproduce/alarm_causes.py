@@ -22,6 +22,7 @@ from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM, named_causes
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.day import SMALL
 from asm_gym.scripts.reproduce.kit import Findings
 from asm_gym.synthetic_arm import JOINTS, SyntheticArm
 
@@ -62,8 +63,6 @@ class Config(kit.Config):
     """Faults of each channel, and events of each kind, at each size."""
     every: int = option(1, quick=9, least=1)
     """One in so many channels has faults."""
-    epochs: int = option(0, quick=1)
-    """Passes of the temporal network; 0 for its own number."""
 
 
 @dataclass
@@ -158,11 +157,8 @@ def memory_of(config: Config, seed: int) -> tuple[NeuralASM, Floats]:
     offset = seed * HELD_OUT * 2
     logs = [recorded(offset + n, config.log_s) for n in range(config.logs)]
     episodes = [Episode.from_stream(rows, SPEC) for rows in logs]
-    options: dict[str, Any] = {}
-    if config.epochs:
-        options["epochs"] = config.epochs
     half = len(episodes) // 2
-    memory = NeuralASM(SPEC, seed=seed, **options).fit(episodes[:half])
+    memory = NeuralASM(SPEC, seed=seed, **SMALL).fit(episodes[:half])
     memory.calibrate(episodes[half:], FALSE_ALARM_RATE)
     return memory, np.ptp(np.concatenate(logs), axis=0).astype(np.float64)
 
@@ -213,8 +209,8 @@ def _truth(fault: Fault) -> str:
 def _name_of(alarms: Sequence[Any]) -> str:
     """Return the name of the cause of the first alarm whose cause is known; empty without an alarm."""
     for alarm in alarms:
-        if alarm.cause and not alarm.cause.startswith(named_causes.UNEXPLAINED):
-            return str(alarm.cause).partition(" of ")[0]
+        if alarm.cause_name not in ("", named_causes.UNEXPLAINED):
+            return str(alarm.cause_name)
     if alarms:
         return named_causes.UNEXPLAINED
     return ""

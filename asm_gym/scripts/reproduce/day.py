@@ -57,11 +57,7 @@ SPEC = StreamSpec(
     source="table",
 )
 # A small memory learns such repeated work in a minute.
-SMALL: dict[str, Any] = {
-    "hidden_size": 64,
-    "association_size": 160,
-    "epochs": 10,
-}
+SMALL: dict[str, Any] = {"hidden_size": 64, "association_size": 160, "epochs": 10}
 FORCE = SPEC.slices["force"].start
 WIDTH = SPEC.slices["width"].start
 TORQUE = SPEC.slices["tau"].start
@@ -291,9 +287,11 @@ def record_of(event: Event, own: Sequence[Alarm]) -> dict[str, object]:
     """Return a line of the table: an event beside its incidents."""
     delay = ""
     named = ""
+    called = ""
     if own:
         delay = f"{own[0].start - event.start:.2f}"
         named = own[0].channel
+        called = own[0].cause
     return {
         "event": event.name,
         "from [h]": f"{event.start / 3600:.2f}",
@@ -302,4 +300,5 @@ def record_of(event: Event, own: Sequence[Alarm]) -> dict[str, object]:
         "first after [s]": delay,
         "names": named,
         "of": ", ".join(event.channels) or "the whole arm",
+        "called": called,
     }
