@@ -119,6 +119,12 @@ def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, ne
     assert f"did you mean '{near}'?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("argv", [("--rate",), ("--rate", "--quick")])
+def test_an_option_without_its_value_is_told_what_it_needs(argv, capsys):
+    assert run(*argv) == 2
+    assert capsys.readouterr().err == "asm-gym try: --rate needs HZ\n"
+
+
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [

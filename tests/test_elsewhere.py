@@ -463,6 +463,9 @@ def own_class():
 def test_robosuites_own_gym_wrapper_is_recorded():
     from robosuite.wrappers import GymWrapper
 
+    from asm_gym.envs.robosuite_backend import import_robosuite
+
+    import_robosuite()
     options = {
         "has_renderer": False,
         "has_offscreen_renderer": False,

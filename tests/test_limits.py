@@ -10,6 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asm_gym import collect
 from asm_gym.data.action_meaning import ActionMeaning
 from asm_gym.data.episode import Episode
 from asm_gym.detection.healthy_ranges import LEAD, healthy_ranges, share_beyond
@@ -17,6 +18,7 @@ from asm_gym.exceptions import LimitsLacking, NotFitted
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.limit_formats import FORMATS
 from asm_gym.monitors.robot_limits import EXTERNAL_TORQUE, NEAR, POSITION, TARGET_DISTANCE, kind_of
+from asm_gym.policies.hostile import HOSTILE
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -69,6 +71,30 @@ def test_a_healthy_hour_stays_within_the_limits_and_a_hard_push_does_not(monitor
     near = np.mean(loads > NEAR * limits.of(EXTERNAL_TORQUE)[0].high)
     assert limits.of(EXTERNAL_TORQUE)[0].near == pytest.approx(near, abs=0.02)
     assert limits.of(POSITION)[1].high <= 1.0  # its stop
+
+
+def test_an_episode_passes_the_limits_that_one_of_its_rows_is_beyond(monitor):
+    limits = monitor.limits()
+    episode = healthy(2000)
+    assert limits.passed(episode) == ()
+    episode.stream[7, 4] = 1.1 * limits.of(EXTERNAL_TORQUE)[0].high
+    episode.stream[9, 1] = limits.of(POSITION)[1].low - 0.1
+    assert [limit.label for limit in limits.passed(episode)] == [
+        "joint_position[1]",
+        "external_torque[0]",
+    ]
+
+
+@pytest.mark.parametrize("robot", ["panda", "sawyer", "iiwa"])
+def test_healthy_lifts_stay_within_the_limits_of_a_shipped_memory_and_ramming_does_not(robot):
+    memory = NeuralASM.pretrained(robot)
+    limits = memory.limits()
+    assert not limits.of(TARGET_DISTANCE)  # a controller of poses takes changes
+    alone = {"workers": 1, "robot": memory.spec.source, "seed": 900}
+    for episode in collect("asm_gym/Lift-v0", "scripted", episodes=2, **alone):
+        assert limits.passed(episode) == ()
+    ramming = collect("asm_gym/Lift-v0", lambda env: HOSTILE["down"](env, 0, 1.0), 1, **alone)
+    assert limits.passed(ramming[0])
 
 
 def test_the_margin_scales_what_is_limited_and_must_not_be_below_one(monitor):

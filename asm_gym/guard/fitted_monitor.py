@@ -14,13 +14,11 @@ from asm_gym.data.episode import CONTROLLER
 from asm_gym.exceptions import SpecMismatch
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import UNNAMED, StreamSpec
 from asm_gym.stream_view import StreamView
 from asm_gym.validation import check_number, short_repr
 
 LOG = logging.getLogger("asm_gym.safety")
-
-UNNAMED = {"", "spaces", "table"}  # sources of streams that do not say whose they are
 
 STALE = "monitor: it was fitted while it watched; reset() takes it over"
 

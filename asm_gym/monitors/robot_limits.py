@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.detection.healthy_ranges import LEAD, Floats, share_beyond
 from asm_gym.exceptions import NotFitted
-from asm_gym.spec import MOTOR, Channel
+from asm_gym.spec import MOTOR, UNNAMED, Channel
 from asm_gym.validation import check_number
 
 MARGIN = 1.25
@@ -92,6 +93,18 @@ class RobotLimits:
         """Return the limits of a kind; empty without any."""
         return tuple(limit for limit in self.limits if limit.kind == kind)
 
+    def passed(self, episode: Episode) -> tuple[Limit, ...]:
+        """Return the limits that some row of an episode passes; a number that it lacks passes none."""
+        labels = episode.spec.labels
+        found = []
+        for limit in self.limits:
+            if limit.kind == TARGET_DISTANCE or limit.label not in labels:
+                continue
+            values = episode.stream[:, labels.index(limit.label)]
+            if np.any((values < limit.low) | (values > limit.high)):
+                found.append(limit)
+        return tuple(found)
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, as JSON holds them."""
         return {
@@ -117,8 +130,11 @@ def limits_of(monitor: Any, margin: float = MARGIN) -> RobotLimits:
     if monitor.ranges_ is None:
         raise NotFitted("this monitor", "has no healthy ranges", "calibrate(nominal_episodes)")
     spec = monitor.spec
+    robot = spec.source
+    if robot in UNNAMED:
+        robot = ""
     return RobotLimits(
-        robot=spec.source,
+        robot=robot,
         rate=1.0 / spec.dt,
         margin=margin,
         limits=tuple(_of_ranges(monitor, margin)),
@@ -152,7 +168,8 @@ def _of_ranges(monitor: Any, margin: float) -> Iterator[Limit]:
         part = spec.slices[channel.name]
         columns = range(*part.indices(spec.size))
         if channel.group == MOTOR:
-            yield from _of_targets(channel, ranges, columns, margin)
+            if CONTROLLER not in monitor.about:  # a simulated controller takes changes
+                yield from _of_targets(channel, ranges, columns, margin)
         elif f"{channel.name}_peak" not in spec.slices:
             yield from _of_senses(channel, ranges, columns, margin)
 

@@ -135,10 +135,14 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
     all_fields = fields(cast(Any, kind))
     named = [each.name for each in all_fields if not each.metadata.get("positional")]
     options = ["--" + field_name.replace("_", "-") for field_name in named] + ["--help"]
-    for word in args:
+    values = {each.name: each.metadata.get("metavar") for each in all_fields}
+    for word, following in zip(args, [*args[1:], "--"], strict=False):
         if word.startswith("--") and not word.startswith("--tyro-"):
-            option_name, _, _ = word.partition("=")
+            option_name, given, _ = word.partition("=")
             check_choice("option", option_name.replace("_", "-"), options)
+            needed = values.get(option_name[2:].replace("-", "_"))
+            if needed and not given and following.startswith("--"):
+                raise ValueError(f"{option_name} needs {needed}")
     unchecked = tyro.cli(
         _unchecked(kind, "--quick" in args),
         args=args,

@@ -12,11 +12,11 @@ from functools import partial
 from typing import Literal
 
 from rich.console import Console
-from rich.table import Table
 
+from asm_gym.evaluation.tables import Table, tabulate
 from asm_gym.monitors import load_monitor
 from asm_gym.monitors.limit_formats import FORMATS
-from asm_gym.monitors.robot_limits import MARGIN, RobotLimits
+from asm_gym.monitors.robot_limits import MARGIN, TARGET_DISTANCE, Limit, RobotLimits
 from asm_gym.monitors.shipped import pretrained, pretrained_file
 from asm_gym.scripts.command import Checked, option, run
 
@@ -48,20 +48,23 @@ def print_limits(args: Args, console: Console) -> None:
         print(FORMATS[args.format](limits))
 
 
+COLUMNS: dict[str, Callable[[Limit], str]] = {
+    "number": lambda limit: (
+        f"target of {limit.label}" if limit.kind == TARGET_DISTANCE else limit.label
+    ),
+    "healthy": lambda limit: f"{limit.least:.3g} to {limit.most:.3g}",
+    "limit": lambda limit: f"{limit.low:.3g} to {limit.high:.3g}",
+    "unit": lambda limit: limit.unit,
+    "near it": lambda limit: "" if limit.near is None else f"{limit.near:.2%}",
+}
+"""Cells of a limit; *near it* is a share of healthy rows."""
+
+
 def table_of(limits: RobotLimits) -> Table:
     """Return a row for each limit."""
-    title = f"{limits.robot or 'This robot'}: healthy motion, and limits with a margin of {limits.margin:g}"
-    table = Table(title=title)
-    for column in ("limited", "number", "unit", "healthy", "limit", "rows near it"):
-        table.add_column(column)
-    for limit in limits.limits:
-        near = "not kept"
-        if limit.near is not None:
-            near = f"{limit.near:.2%}"
-        healthy = f"{limit.least:.3g} to {limit.most:.3g}"
-        allowed = f"{limit.low:.3g} to {limit.high:.3g}"
-        table.add_row(limit.kind, limit.label, limit.unit, healthy, allowed, near)
-    return table
+    robot = limits.robot or "This robot"
+    caption = f"{robot}: healthy motion, and limits with a margin of {limits.margin:g}"
+    return tabulate(caption, COLUMNS, limits.limits)
 
 
 main: Callable[..., int] = partial(run, "limits", Args, print_limits)

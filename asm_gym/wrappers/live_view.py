@@ -37,6 +37,7 @@ Row = NDArray[np.floating[Any]]  # (D,)
 VIEWER = "view"
 MOST_WORST = 3  # channels that are shown beside what is expected
 MOST_VIEWS = 12  # channels with a panel of their own
+FEW_VIEWS = 4  # so many have room for a legend; in others a line is named beside the pointer
 AXIS = (0.0, 3.0)  # of surprise, in thresholds
 FRAME_S = 0.1  # time between two frames [s]
 ALARM = "alarm"  # state of a policy that goes on in alarm
@@ -129,9 +130,11 @@ class LiveView:
         state = panels.StateTimelineView(origin="/state", name="state")
         worst = panels.TextDocumentView(origin="/worst", name="worst channels")
         camera = panels.Spatial2DView(origin="/camera", name="camera")
+        legend = panels.PlotLegend(visible=len(self._spec.channels) <= FEW_VIEWS)
         channels = [
             panels.TimeSeriesView(
                 name=f"{channel.name} [{channel.unit}]",
+                plot_legend=legend,
                 contents=[self._path("sensed", channel.name), self._path("expected", channel.name)],
             )
             for channel in self._spec.channels[:MOST_VIEWS]

@@ -148,6 +148,8 @@ def _compiled(root: Element, moving: Container[str | None]) -> Any:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         for name, value in COMPILER.items():
             setattr(spec.compiler, name, value)
+        for equality in list(spec.equalities):  # of mimic joints, which MuJoCo 4 reads
+            spec.delete(equality)
         for joint in list(spec.joints):
             if joint.name not in moving:
                 spec.delete(joint)
