@@ -40,8 +40,8 @@ HEADINGS = (
     *("sensed", "expected", "±", "unit", "rows around it", "cause", "what to do"),
 )
 TO_READ = (
-    *("from", "to", "log", "what happened", "what to do", "channel", "sensed", "expected"),
-    *("thresholds", "rows around it"),
+    *("from", "lasts", "what happened", "what to do", "channel", "sensed", "expected"),
+    *("thresholds", "rows around it", "log"),
 )
 """Headings of the alarms in a report."""
 Floats = NDArray[np.float64]
@@ -117,9 +117,9 @@ class Alarm(NamedTuple):
             sensed = f"{self.beside.sensed:.4g} {unit}"
             expected = f"{self.beside.expected:.4g} ± {self.beside.plus_minus:.2g} {unit}"
         return (
-            *(self.shown(self.start), self.shown(self.end), self.log),
+            *(self.shown(self.start), f"{self.end - self.start:.3g} s"),
             *(self.cause or self.why, self.remedy, self.channel, sensed, expected),
-            *(thresholds_shown(self.excess), self.evidence),
+            *(thresholds_shown(self.excess), self.evidence, self.log),
         )
 
     def cells(self, to_read: bool = False) -> tuple[str, ...]:

@@ -87,11 +87,16 @@ def _figures(heading: str, kind: str, drawn: Mapping[str, Figure]) -> str:
 def _table(table: Table) -> str:
     """Return a table; on a narrow screen each cell stands in a line of its own, behind its heading."""
     headings = [escape(heading) for heading in table.headings]
-    lines = ["".join(f"<th>{heading}</th>" for heading in headings)]
+    columns = list(zip(*table.rows, strict=True)) or [()] * len(headings)
+    kinds = [' class="text"' if any(map(_is_sentence, cells)) else "" for cells in columns]
+    titles = zip(kinds, headings, strict=True)
+    lines = ["".join(f"<th{kind}>{heading}</th>" for kind, heading in titles)]
     for row in table.rows:
         name, *cells = (_LINKED.sub(_LINK, escape(str(cell))) for cell in row)
-        named = zip(headings[1:], cells, strict=True)
-        values = "".join(_cell(heading, cell) for heading, cell in named)
+        named = zip(kinds[1:], headings[1:], cells, strict=True)
+        values = "".join(
+            f'<td{kind} data-name="{heading}">{cell}</td>' for kind, heading, cell in named
+        )
         lines.append(f"<th>{name}</th>{values}")
     head, *body = (f"<tr>{line}</tr>\n" for line in lines)
     caption = f"<caption>{escape(table.caption)}</caption>"
@@ -99,12 +104,10 @@ def _table(table: Table) -> str:
     return f'<div class="scroll"><table>{caption}\n{content}</table></div>'
 
 
-def _cell(heading: str, text: str) -> str:
-    """Return a cell, both texts being HTML; sentences may break, numbers and names may not."""
-    kind = ""
-    if text.count(" ") >= FEWEST_SPACES and "±" not in text:
-        kind = ' class="text"'
-    return f'<td{kind} data-name="{heading}">{text}</td>'
+def _is_sentence(cell: object) -> bool:
+    """Return whether a cell may break into lines, as numbers and names may not."""
+    text = str(cell)
+    return text.count(" ") >= FEWEST_SPACES and "±" not in text
 
 
 def _figure(caption: str, figure: Figure) -> str:
