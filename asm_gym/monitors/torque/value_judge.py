@@ -6,6 +6,7 @@
 
 ``calibrate`` finds b and p from the maxima of nominal episodes: of the alarms in them that the promised rate allows,
 values raise half and changes half. Each then has the threshold that it would have by itself for half of the rate.
+Where less than two alarms are allowed, each has its largest maximum: together they may raise up to twice the rate.
 A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
 a tenth of a second count as one.
 """
