@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.hand_speed import FREE, NO_SPEED_LIMIT, Floats, SpeedLimit, allowed_share
+from asm_gym.detection.hand_speed import (
+    FASTER_WHERE_FREE,
+    NO_SPEED_LIMIT,
+    Floats,
+    SpeedLimit,
+    allowed_share,
+)
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
@@ -140,7 +146,7 @@ class ContactLimits:
         return limit._replace(
             grid=self.pace.grid,
             low=self.pace.low,
-            free_speed=FREE * limit.hand_speed,
+            free_speed=FASTER_WHERE_FREE * limit.hand_speed,
             momentum=momentum,
             pace_momentum=self.pace.pace_momentum,
             least_upright=self.pace.least_upright,
@@ -156,7 +162,8 @@ class ContactLimits:
         momentum: float = 0.0,
     ) -> float:
         """Return the share that a hand may have of a motion; see ``hand_speed.allowed_share``."""
-        return allowed_share(self.speed_limit(), arm, place, twist, speed, soon, momentum)
+        limit = self.speed_limit()
+        return allowed_share(limit, arm, place, twist, speed=speed, soon=soon, momentum=momentum)
 
 
 def healthy_forces(

@@ -5,7 +5,7 @@ Near a place where healthy hands went at most as fast as g along each axis, a ha
     s = max(min(L' / |v|, P / p), min(k, P' / p)),      k = min_i (1.25 g_i + slack_i) / |v_i|
 
 v (6,) is a twist, linear then angular [m/s], [rad/s]; |v| the speed of the hand's fastest point [m/s]. L' is the usual
-limit L, up to ``FREE`` times as much the farther away everything is. p is the momentum of the arm on its way to
+limit L, up to twice as much the farther away everything is. p is the momentum of the arm on its way to
 something [N s], P its limit where no healthy hand was and P' where one was: none in a task that is known. Downwards,
 where what a hand meets is hard, k allows at most L, and at most 1.05 times the speed of healthy hands. In tasks whose
 healthy hands point down all the time, k counts only for hands that do so: one that is tilted meets things with other
@@ -32,7 +32,7 @@ ABOVE_HEALTHY = 1.25
 ABOVE_HEALTHY_DOWN = 1.05  # the same downwards
 SPEED_SLACK = np.array([0.03, 0.03, 0.03, 0.15, 0.15, 0.15])  # and by so much faster [m/s], [rad/s]
 DOWN_SLACK = 0.03  # downwards as fast as this, whatever healthy hands did [m/s]
-FREE = 2.0  # where nothing is near a hand may go so many times as fast
+FASTER_WHERE_FREE = 2.0  # where nothing is near a hand may go so many times as fast
 LEAST_SPEED = 1e-9  # no speed is divided by less [m/s]
 
 

@@ -152,9 +152,9 @@ class IncidentBook:
         owner = max(surprising, key=lambda i: self._strength_in(i, strengths))
         allowed = max(1.0, *(SPREAD * i.spread for i in surprising))
         if not settling and pooled(rest, self._power) > allowed:
-            columns = row.blamed()
-            if not columns or not known[list(columns)].all():
-                return self._open_elsewhere(row, rest, known, columns)
+            opened = self._open_elsewhere(row, rest, known)
+            if opened is not None:
+                return opened
             owner.spread = float(rest.max())
         elif row.time <= owner.start + SPREADING_S:
             owner.spread = max(owner.spread, float(rest.max()))
@@ -210,10 +210,14 @@ class IncidentBook:
         opened.blamed = columns
         return opened
 
-    def _open_elsewhere(
-        self, row: AlarmRow, rest: Floats, known: Mask, columns: Blamed
-    ) -> Incident:
-        """Open an incident by the strengths (D,) of a row that are in none of the ``known`` channels (D,)."""
+    def _open_elsewhere(self, row: AlarmRow, rest: Floats, known: Mask) -> Incident | None:
+        """Open an incident by the strengths (D,) of a row that are in none of the ``known`` channels (D,).
+
+        None where blame points to known channels alone, whose error spreads.
+        """
+        columns = row.blamed()
+        if columns and known[list(columns)].all():
+            return None
         touched = (rest > TOUCHED) | (rest == rest.max())
         new = tuple(column for column in columns if not known[column])
         if not new:

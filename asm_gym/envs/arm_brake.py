@@ -25,7 +25,7 @@ A motor that delivers less torque than it was commanded is commanded so much mor
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,6 +67,14 @@ LEAST_INVERSE_MASS = 1e-4  # of a point that some directions cannot move [1/kg]
 
 # Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].
 BESIDE_BASE = 0.3
+
+
+class Approach(NamedTuple):
+    """How near an arm is to touching something."""
+
+    soon: float  # how soon a point does: 1 for within T, 0 for never
+    momentum: float  # p, the largest that counts [N s]
+    leans: bool  # a link but the hand touches something already
 
 
 @partial(inner, inlined=True)
@@ -116,14 +124,14 @@ def fastest_point(views: Views, arm: Arm) -> float:
 
 
 @partial(inner, inlined=True)
-def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[float, float, bool]:
-    """Return how soon a link of arm ``a`` touches an obstacle, p, and whether one but the hand does already.
+def approach_of(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> Approach:
+    """Return how arm ``a`` approaches obstacles in its present motion.
 
     ``work.factor`` is the Cholesky factor of the arm's mass matrix.
     """
     soonest = 0.0
     hardest = 0.0
-    touches = False
+    leans = False
     n = 0
     while arm.links[n] >= 0:
         if ahead.counts[a, n] == EVERYWHERE:
@@ -133,7 +141,7 @@ def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[
         for k in range(ahead.counts[a, n]):
             point = ahead.points[a, n, k]
             gap = present_gap(views, arm.links[n], point, work.place)
-            touches = touches or (n > 0 and gap <= 0.0)
+            leans = leans or (n > 0 and gap <= 0.0)
             origin = views.subtree_com[arm.root]
             x, y, z = velocity_at(views.cvel[arm.links[n]], work.place, origin)
             soon = how_soon(point.way, gap, x, y, z)
@@ -142,7 +150,7 @@ def approach(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> tuple[
                 soonest = max(soonest, soon)
                 hardest = max(hardest, soon * momentum)
         n += 1
-    return soonest, hardest, touches
+    return Approach(soon=soonest, momentum=hardest, leans=leans)
 
 
 @partial(inner, inlined=True)
@@ -159,7 +167,7 @@ def present_gap(views: Views, link: int, point: Any, place: Floats) -> float:
 
 @inner
 def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
-    """Return how soon a point touches an obstacle that moves so fast [m/s]: 1 for within T, 0 for never.
+    """Return how soon a point touches an obstacle that moves so fast [m/s]; see ``Approach``.
 
     Args:
         way: (3,) to the obstacle, a unit vector.
@@ -213,10 +221,11 @@ def stopping_impulse(inverse_mass: Floats, factor: Floats, velocity: Floats) -> 
 
 @partial(inner, inlined=True)
 def share_at(
-    views: Views, arm: Arm, a: int, limit: SpeedLimit, twist: Floats, soon: float, momentum: float
+    views: Views, arm: Arm, a: int, limit: SpeedLimit, twist: Floats, approach: Approach
 ) -> float:
     """Return the share that arm ``a`` may have of a motion of its hand, a twist (6,), where the hand is now."""
-    share = usual_share(limit, twist_speed(twist), soon, momentum)
+    momentum = approach.momentum
+    share = usual_share(limit, twist_speed(twist), approach.soon, momentum)
     upright = -views.site_xmat[arm.site, 8]  # 1 for a hand that points down
     if limit.grid.size > 0 and upright >= limit.least_upright:
         place = views.site_xpos[arm.site]
@@ -225,22 +234,12 @@ def share_at(
 
 
 @partial(inner, inlined=True)
-def present_share(
-    views: Views, arm: Arm, a: int, limit: SpeedLimit, ahead: Ahead, work: Work
-) -> tuple[float, bool]:
-    """Return the share that arm ``a`` may have of its present motion; and see ``approach``."""
-    twist = work.twist
+def write_twist(arm: Arm, work: Work) -> None:
+    """Write the present twist of an arm's hand."""
     for axis in range(6):
-        twist[axis] = 0.0
+        work.twist[axis] = 0.0
         for i in range(arm.joint_count):
-            twist[axis] += work.jacobian[axis, i] * work.velocities[i]
-    soon = 1.0
-    momentum = 0.0
-    touches = False
-    if limit.momentum < np.inf:
-        cholesky(work.mass, arm.joint_count, work.factor)
-        soon, momentum, touches = approach(views, arm, a, ahead, work)
-    return share_at(views, arm, a, limit, twist, soon, momentum), touches
+            work.twist[axis] += work.jacobian[axis, i] * work.velocities[i]
 
 
 @partial(inner, inlined=True)
@@ -261,11 +260,16 @@ def slow_down(
     limit = limits.motion[0]
     if is_beside_base(views, arm):
         limit = limits.motion[1]
-    share, touches = present_share(views, arm, a, limit, limits.ahead, work)
+    write_twist(arm, work)
+    approach = Approach(soon=1.0, momentum=0.0, leans=False)
+    if limit.momentum < np.inf:
+        cholesky(work.mass, arm.joint_count, work.factor)
+        approach = approach_of(views, arm, a, limits.ahead, work)
+    share = share_at(views, arm, a, limit, work.twist, approach)
     share = min(share, speed_limit / speed)
     excess = max(0.0, 1.0 - share)
     goal.drive_lost = max(min(1.0, ALL_DRIVE * excess), DRIVE_LOST_KEPT * goal.drive_lost)
-    if touches:
+    if approach.leans:
         goal.drive_lost = max(goal.drive_lost, LEANING_DRIVE_LOST)
     if excess == 0.0 and goal.drive_lost < LEAST_DRIVE_LOST:
         return False

@@ -1,4 +1,4 @@
-"""Where an arm might meet something: only towards it is the arm's momentum limited.
+"""Where an arm might meet something: only towards it is the arm slowed down more than elsewhere.
 
 Around each geom of the arm there is a ball, and around each geom of anything else a box. Of pairs whose ball and box
 are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the place and the speed
@@ -49,6 +49,8 @@ class ArmGeoms(NamedTuple):
     frames: Floats  # (ngeom, 9)
     body_places: Floats  # (nbody, 3)
     body_frames: Floats  # (nbody, 9)
+    is_carried: NDArray[np.bool_]  # (nbody,) scratch: the hand touches a body that lies freely
+    ends: Floats  # (2, 3) scratch: the nearest points of two geoms [m]
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData, arms: Arms, a: int) -> ArmGeoms:
@@ -73,6 +75,8 @@ class ArmGeoms(NamedTuple):
             frames=data.geom_xmat,
             body_places=data.xpos,
             body_frames=data.xmat,
+            is_carried=np.zeros(model.nbody, np.bool_),
+            ends=np.zeros((2, 3)),
         )
 
 
@@ -90,8 +94,6 @@ class Obstacles:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, arms: Arms) -> None:
         self._data = data
-        self._is_carried = np.zeros(model.nbody, np.bool_)
-        self._ends = np.zeros((2, 3))
         self._geoms = [ArmGeoms.of(model, data, arms, a) for a in range(len(arms))]
         self.ahead = Ahead.everywhere(len(arms))
 
@@ -99,7 +101,7 @@ class Obstacles:
         """Write where the arms are now."""
         touching = self._data.contact.geom
         for a, geoms in enumerate(self._geoms):
-            note_ahead(geoms, touching, self._is_carried, self._ends, self.ahead, a)
+            note_ahead(geoms, touching, self.ahead, a)
 
 
 def _link_of(model: mujoco.MjModel, arm: Arm, body: int) -> int:
@@ -123,58 +125,46 @@ def _free_body(model: mujoco.MjModel, body: int) -> int:
 
 
 @compiled
-def note_ahead(
-    arm: Any,
-    touching: NDArray[np.int32],
-    is_carried: NDArray[np.bool_],
-    ends: Floats,
-    ahead: Ahead,
-    a: int,
-) -> None:
+def note_ahead(arm: Any, touching: NDArray[np.int32], ahead: Ahead, a: int) -> None:
     """Write where the links of arm ``a`` are near something.
 
     Args:
         arm: its ``ArmGeoms``.
         touching: (N, 2) geoms that touch.
-        is_carried: (nbody,) scratch: the hand touches the body.
-        ends: (2, 3) scratch: the nearest points of two geoms.
         ahead: written to.
         a: index of the arm.
     """
     ahead.counts[a, :] = 0
-    note_carried(arm, touching, is_carried)
+    note_carried(arm, touching)
     for geom in arm.own:
-        note_geom(arm, geom, arm.links[geom], is_carried, ends, ahead, a)
+        note_geom(arm, geom, arm.links[geom], ahead, a)
     for geom in arm.others:
-        if arm.carriable[geom] >= 0 and is_carried[arm.carriable[geom]]:
-            note_geom(arm, geom, 0, is_carried, ends, ahead, a)
+        if belongs_to_hand(arm, geom):
+            note_geom(arm, geom, 0, ahead, a)
 
 
 @inner
-def note_carried(arm: Any, touching: NDArray[np.int32], is_carried: NDArray[np.bool_]) -> None:
+def note_carried(arm: Any, touching: NDArray[np.int32]) -> None:
     """Write which bodies that lie freely the hand touches."""
-    is_carried[:] = False
+    arm.is_carried[:] = False
     for n in range(len(touching)):
         for side in range(2):
             body = arm.carriable[touching[n, side]]
             if body >= 0 and arm.links[touching[n, 1 - side]] == 0:
-                is_carried[body] = True
+                arm.is_carried[body] = True
 
 
 @inner
-def note_geom(
-    arm: Any,
-    geom: int,
-    link: int,
-    is_carried: NDArray[np.bool_],
-    ends: Floats,
-    ahead: Ahead,
-    a: int,
-) -> None:
+def belongs_to_hand(arm: Any, geom: int) -> bool:
+    """Whether a geom is one of what the hand touches and can carry."""
+    return arm.carriable[geom] >= 0 and arm.is_carried[arm.carriable[geom]]
+
+
+@inner
+def note_geom(arm: Any, geom: int, link: int, ahead: Ahead, a: int) -> None:
     """Note the points of a geom of a link that are near something."""
     for other in arm.others:
-        body = arm.carriable[other]
-        if body >= 0 and is_carried[body]:
+        if belongs_to_hand(arm, other):
             continue
         # A link turns on the one that carries it, and never meets it.
         carrier = arm.parents[arm.bodies[geom]]
@@ -182,11 +172,11 @@ def note_geom(
             continue
         if box_distance(arm, geom, other) > NEAR + arm.radii[geom]:
             continue
-        gap = _distance(arm.model, arm.data, geom, other, NEAR, ends.ctypes.data)
+        gap = _distance(arm.model, arm.data, geom, other, NEAR, arm.ends.ctypes.data)
         if gap < NEAR:
             point = point_to_keep(ahead, a, link, gap)
             if point >= 0:
-                write_point(arm, arm.link_bodies[link], ends, gap, ahead.points[a, link, point])
+                write_point(arm, arm.link_bodies[link], gap, ahead.points[a, link, point])
 
 
 @inner
@@ -221,12 +211,12 @@ def point_to_keep(ahead: Ahead, a: int, link: int, gap: float) -> int:
 
 
 @inner
-def write_point(arm: Any, body: int, ends: Floats, gap: float, point: Any) -> None:
-    """Write the point of a link, a body, that has the nearest points ``ends`` (2, 3) with another geom."""
+def write_point(arm: Any, body: int, gap: float, point: Any) -> None:
+    """Write the point of a link, a body, from the nearest points ``arm.ends`` of one of its geoms and another."""
     point.gap = gap
     for axis in range(3):
-        point.place[axis] = ends[0, axis]
-        point.way[axis] = ends[1, axis] - ends[0, axis]
+        point.place[axis] = arm.ends[0, axis]
+        point.way[axis] = arm.ends[1, axis] - arm.ends[0, axis]
     distance = length(point.way)
     if gap < 0.0:
         distance = -distance  # the nearest points of geoms that overlap lie the other way

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.envs.arm_brake import (
+    Approach,
     how_soon,
     is_beside_base,
     present_gap,
@@ -223,7 +224,8 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         momentum = 0.0
         if soon > 0.0 and limit.momentum < np.inf:
             momentum = soon * asked_momentum(views, motion)
-        share = share_at(views, arm, a, limit, motion.twist, soon, momentum)
+        approach = Approach(soon=soon, momentum=momentum, leans=False)
+        share = share_at(views, arm, a, limit, motion.twist, approach)
         brake_speeds[a] = max(limit.hand_speed, share * twist_speed(motion.twist))
         if share < 1.0:
             scale_part(arm, np.float32(share), rest, slowed)

@@ -43,8 +43,7 @@ class EpisodeLimits:
                 limits = replace(limits, stays=False, hand_speed=np.inf)
             careful = limits.reduced(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
 
-        self._usual = [limits] * facts.count  # of each robot
-        self._careful = careful
+        self._usual_and_careful = limits, careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))
         # (n,) of the policy, under the careful limits
         self._steps_left = np.zeros(facts.count, np.int64)
@@ -65,10 +64,7 @@ class EpisodeLimits:
     def _choose(self) -> None:
         is_careful = self._steps_left > 0
         self.steady = not is_careful.any()
-        limits = self._usual.copy()
-        for robot in np.flatnonzero(is_careful).tolist():
-            limits[robot] = self._careful
-        self.now = tuple(limits)
+        self.now = tuple(self._usual_and_careful[int(careful)] for careful in is_careful)
 
 
 def limits_of(

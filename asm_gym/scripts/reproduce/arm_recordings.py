@@ -6,7 +6,7 @@ A set holds runs in which the arm did nothing wrong, and perhaps runs with fault
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -214,6 +214,17 @@ def synthetic_runs(_: Path) -> Runs:
 
 
 SECONDS = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
+HIRO = RealArm(
+    robot="Kawada HIRO",
+    place="hiro_snap_assembly",
+    source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
+    read=hiro_runs,
+    piece_s=np.inf,
+    rate=50.0,
+    efforts=("force", "torque"),
+    has_joint_torques=False,
+    one_campaign=False,
+)
 ARMS = {
     "panda": RealArm(
         robot="Franka Panda",
@@ -248,28 +259,8 @@ ARMS = {
         rate=125.0,
         urdf="ur3_robot.urdf",
     ),
-    "hiro": RealArm(
-        robot="Kawada HIRO",
-        place="hiro_snap_assembly",
-        source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
-        read=hiro_runs,
-        piece_s=np.inf,
-        rate=50.0,
-        efforts=("force", "torque"),
-        has_joint_torques=False,
-        one_campaign=False,
-    ),
-    "hiro_repeated": RealArm(
-        robot="Kawada HIRO, one programme",
-        place="hiro_snap_assembly",
-        source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
-        read=hiro_repetitions,
-        piece_s=np.inf,
-        rate=50.0,
-        efforts=("force", "torque"),
-        has_joint_torques=False,
-        one_campaign=False,
-    ),
+    "hiro": HIRO,
+    "hiro_repeated": replace(HIRO, robot="Kawada HIRO, one programme", read=hiro_repetitions),
     "armpi": RealArm(
         robot="ArmPi FPV",
         place="armpi_fpv_faults",
