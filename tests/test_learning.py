@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from asm_gym.evaluation.statistics import Estimate
 from asm_gym.exceptions import UnsupportedEnvironment
@@ -81,8 +81,19 @@ def test_sac_stores_what_the_guard_executed():
     assert not held.all()
 
 
+def test_sac_learns_in_a_guarded_vector_with_scaled_observations():
+    guarded = VectorNeuralASMSafety(vector(8, 8), FadingMonitor((2,)), on_alarm="hold")
+    scaled = VecNormalize(LearnerVector(guarded), norm_reward=False)
+    agent = ExecutedSAC("MlpPolicy", scaled, learning_starts=100, seed=0, buffer_size=64)
+    agent.learn(16)
+    held = (agent.replay_buffer.actions[:8, :, :2] == 0).all(axis=2)  # the third is the grip
+    assert held.any()
+    assert not held.all()
+
+
+@pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("many", [False, True])
-def test_actions_changed_outside_the_guard_are_refused(many):
+def test_actions_changed_outside_the_guard_are_refused(many, scaled):
     if many:
         rescaled = gym.wrappers.vector.RescaleAction(
             VectorNeuralASMSafety(vector(8, 8), FadingMonitor((2,)), on_alarm="monitor"), -2.0, 2.0
@@ -91,6 +102,11 @@ def test_actions_changed_outside_the_guard_are_refused(many):
     else:
         guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="hold")
         envs = RescaleAction(guarded, -2.0, 2.0)
+    if scaled:
+        if not many:
+            single = envs
+            envs = DummyVecEnv([lambda: single])
+        envs = VecNormalize(envs)
     with pytest.raises(UnsupportedEnvironment, match="RescaleAction outside the guard"):
         ExecutedSAC("MlpPolicy", envs)
 
