@@ -13,8 +13,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from asm_gym.evaluation.statistics import Estimate
 from asm_gym.exceptions import UnsupportedEnvironment
+from asm_gym.guard.step_info import LazyInfo
 from asm_gym.rollouts.executed_sac import ExecutedSAC
-from asm_gym.rollouts.learner_vector import LearnerVector
+from asm_gym.rollouts.learner_vector import LearnerVector, of_each
 from asm_gym.rollouts.learning_record import LearningRecord
 from asm_gym.rollouts.priced_cost import Lagrangian, PricedCost
 from asm_gym.rollouts.safety_callback import FIRST_STEPS, SafetyCallback
@@ -62,6 +63,22 @@ def test_the_learner_meets_the_same_alarms_in_a_vector_as_in_single_environments
     assert costs[0] == costs[1]
     assert len(costs[0]) == 4
     assert min(costs[0]) > 0
+
+
+def test_what_the_guard_reports_is_made_only_when_it_is_read():
+    reads = []
+
+    def make():
+        reads.append(1)
+        return {"threshold": np.array([1.0, 2.0])}
+
+    asm = LazyInfo(make)
+    asm["slowed"] = np.array([0.0, 0.5])
+    members = of_each({"asm": asm, "cost": np.array([0.0, 1.0])}, 2)
+    assert members[1]["cost"] == 1.0
+    assert members[1]["asm"]["slowed"] == 0.5
+    assert not reads
+    assert [member["asm"]["threshold"] for member in members] == [1.0, 2.0]
 
 
 def test_another_autoreset_mode_is_refused():
