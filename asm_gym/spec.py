@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from asm_gym.exceptions import DamagedFile, SpecMismatch
 from asm_gym.validation import check_number, short_repr, typed
 
-UNNAMED = {"", "spaces", "table"}  # sources of streams that do not say which robot it is
+LOG = "table"  # source of streams that were read from logs
+UNNAMED = {"", "spaces", LOG}  # sources of streams that do not say which robot it is
 MOTOR = "action"  # the group that holds the commanded action
 HANDLED = "handled"  # the group of the object at the hand, as a tracker of poses sees it
 CARRIED_CHANNEL = "object_carried"  # its channel that says how the object moves

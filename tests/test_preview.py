@@ -41,7 +41,8 @@ def path(speed, commands=(0.0, 0.5)):
 
 def test_what_healthy_policies_commanded_is_their_range_and_their_greatest_step():
     found = healthy_commands(
-        [path(0.2, (0.0, 0.5)), np.vstack([path(0.2, (1.0, 0.5)), path(0.2, (0.4, 0.5))])], HAND
+        [path(0.2, (0.0, 0.5)), np.vstack([path(0.2, (1.0, 0.5)), path(0.2, (0.4, 0.5))])],
+        HAND.motor,
     )
     np.testing.assert_allclose(found, [[0.0, 0.5], [1.0, 0.5], [0.6, 0.0]], atol=1e-6)
 

@@ -216,11 +216,16 @@ def test_a_whole_episode_is_scored_as_row_by_row():
     assert asm.values_ is not None
     episodes = [pushed(cut[45], 1.0), replace(cut[46], stream=cut[46].stream[:37].copy())]
     episodes[1].stream[20, 1] = np.nan
+    episodes[0].stream[70, 1] = 99.0  # misread, for a row
+    episodes[0].stream[80:, 2] = -99.0
     for episode, score in zip(episodes, asm.score_episodes(episodes), strict=True):
         state = asm.initial_state()
         for t, row in enumerate(episode.stream):
             state, surprise = asm.observe(state, row[None])
             assert score.value[t] == pytest.approx(surprise.value[0], rel=1e-6)
+            assert np.isinf(score.value[t]) == (
+                t in ((70, 80) if episode is episodes[0] else (20,))
+            )
             np.testing.assert_allclose(
                 score.attribution[t], surprise.attribution[0], rtol=1e-5, atol=1e-6
             )

@@ -49,9 +49,9 @@ def learned_motion(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.fl
     return np.asarray(solution[0], np.float64)
 
 
-def healthy_commands(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float32]:
-    """Return (3, A) the least, the most, and the greatest change in a row of what healthy streams (T, D) commanded."""
-    commands = [stream[:, spec.motor] for stream in streams]
+def healthy_commands(streams: Sequence[Floats], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return (3, A) the least, the most, and the greatest change in a row of columns (A,) of healthy streams (T, D)."""
+    commands = [stream[:, columns] for stream in streams]
     every = np.concatenate(commands)
     steps = np.concatenate([np.diff(episode, axis=0) for episode in commands])
     greatest_step = np.abs(steps).max(axis=0, initial=0.0)

@@ -76,6 +76,8 @@ class CalibratedMonitor:
         commands_: (3, A) least, most and greatest step of the commands of these episodes; None without.
         ranges_: (8, D) how far each number went in these episodes (``detection.healthy_ranges``); None in files of
             earlier versions.
+        readings_: (3, X) least, most and greatest step of each sense in the episodes of ``fit`` and ``calibrate``; None
+            where no reading is judged by it (``detection.misreadings``).
         wear_: (4, M) how much senses drift between these episodes (``detection.drift``); None without.
     """
 
@@ -88,6 +90,7 @@ class CalibratedMonitor:
     motion_: NDArray[np.floating[Any]] | None
     commands_: NDArray[np.floating[Any]] | None
     ranges_: NDArray[np.floating[Any]] | None
+    readings_: NDArray[np.floating[Any]] | None
     wear_: NDArray[np.floating[Any]] | None
 
     def __init__(self, model: StreamModel, detection: Detection, seed: int = 0) -> None:
@@ -96,6 +99,7 @@ class CalibratedMonitor:
         self.model = model
         self.detection = detection
         self._uncalibrate()
+        self.readings_ = None
         self.learned_from_: Hashes | None = None
         self.ceilings_from_: Hashes | None = None
         self.about: dict[str, Any] = {}
@@ -298,7 +302,7 @@ class CalibratedMonitor:
         self.healthy_ = healthy_forces(streams, self.spec)
         self.pace_ = HandSpeedMap.by_task(episodes, self.spec)
         self.motion_ = learned_motion(streams, self.spec)
-        self.commands_ = healthy_commands(streams, self.spec)
+        self.commands_ = healthy_commands(streams, self.spec.motor)
         self.wear_ = self._healthy_wear(streams)
         meaning: ActionMeaning | None = None
         if ACTIONS in self.about:

@@ -28,6 +28,7 @@ OPTIONAL = {
     "motion_": "motion",
     "commands_": "commands",
     "ranges_": "ranges",
+    "readings_": "readings",
     "wear_": "wear",
 }
 """The array of a checkpoint that keeps each attribute that may be None."""

@@ -19,7 +19,9 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
+from asm_gym.detection.commands import healthy_commands
 from asm_gym.detection.drift import DriftSenses, WearCounter, WearScale, wear_scale
+from asm_gym.detection.misreadings import misread, widened, without_misreadings
 from asm_gym.memory.dynamics import DYNAMICS, RECURRENT
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.blame import Blame
@@ -51,7 +53,7 @@ from asm_gym.monitors.torque.arm_features import (
 from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
 from asm_gym.monitors.weight_packing import rounded
 from asm_gym.scaling import StreamScaler
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import LOG, StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, typed
 
 
@@ -258,7 +260,7 @@ class NeuralASM(CalibratedMonitor):
     ) -> tuple[MonitorState, Surprise]:
         """Observe as in ``CalibratedMonitor``; write the new state to ``out``, a state that is no longer needed."""
         self._require_fitted()
-        rows = checked_rows(state, stream, self.spec)
+        rows = self._without_misreadings(state, checked_rows(state, stream, self.spec))
         # divisor (B,): by it knocks and stops have divided the surprise
         new, surprise, divisor = self._row_kernel()(state, rows, out)
         if self.values_ is not None:
@@ -278,18 +280,43 @@ class NeuralASM(CalibratedMonitor):
             self.spec.require(episode.spec, "the episode")
         scores: dict[int, Surprise] = {}
         for group in groups_side_by_side(episodes):
-            streams = [episodes[index].stream for index in group]
+            streams = [self._read_stream(episodes[index].stream) for index in group]
             found = observe_streams(kernel, self.initial_state(len(group)), streams)
-            for index, (surprise, divisor) in zip(group, found, strict=True):
+            for index, stream, (surprise, divisor) in zip(group, streams, found, strict=True):
                 scores[index] = surprise
                 if self.values_ is not None:
-                    joined = self.values_.join_episode(episodes[index], surprise, divisor)
+                    joined = self.values_.join_episode(stream, surprise, divisor)
                     scores[index] = joined
         return [scores[index] for index in range(len(episodes))]
 
+    def _without_misreadings(
+        self, state: MonitorState, rows: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the next rows (B, D) with NaN for each number that is misread."""
+        if self.readings_ is None:
+            return rows
+        history = state.model.history
+        senses = self.spec.sensory
+        before = history.before[:, -1, senses]
+        wrong = misread(self.readings_, before, rows[:, senses]) & (history.steps > 0)[:, None]
+        if not wrong.any():
+            return rows
+        rows = rows.copy()
+        rows[:, senses] = np.where(wrong, np.nan, rows[:, senses])
+        return rows
+
+    def _read_stream(self, stream: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return a stream (T, D) with NaN for each number that is misread."""
+        if self.readings_ is None:
+            return stream
+        senses = self.spec.sensory
+        read = stream.copy()
+        read[:, senses] = without_misreadings(self.readings_, stream[:, senses])
+        return read
+
     def compiled_row(self) -> RowKernel | None:
         """Return the kernel that does all that ``observe`` does; None where Python takes part in a row."""
-        if self.values_ is not None or self.skills_:
+        if self.values_ is not None or self.readings_ is not None or self.skills_:
             return None
         return self._row_kernel()
 
@@ -336,8 +363,22 @@ class NeuralASM(CalibratedMonitor):
             return scores
         return self.values_.raised(scores)
 
+    def _keep_healthy_ranges(self, episodes: Sequence[Episode]) -> None:
+        super()._keep_healthy_ranges(episodes)
+        if self.readings_ is not None:
+            self._widen_readings(episodes)
+
+    def _widen_readings(self, episodes: Sequence[Episode]) -> None:
+        """Count the readings of healthy episodes as possible."""
+        streams = [episode.stream for episode in episodes]
+        self.readings_ = widened(self.readings_, healthy_commands(streams, self.spec.sensory))
+
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         super()._learn(episodes, progress, warm_start)
+        if not warm_start:
+            self.readings_ = None
+        if self.spec.source == LOG:
+            self._widen_readings(episodes)
         self.values_ = None
         if self.values:
             self.values_ = ValueJudge.learned(episodes, self.seed, self.urdf)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from asm_gym.data.column_names import POSITION_NAME, SPEED_NAME, ratio
 from asm_gym.detection.channel_columns import columns_where
 from asm_gym.monitors.torque.body_model import BodyModel, JointMotion
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import LOG, StreamSpec
 
 Floats = NDArray[np.float64]
 
@@ -219,5 +219,5 @@ def judged_by_values(spec: StreamSpec) -> bool:
     measures_contact = any(
         channel.group == "wrench" or "external" in channel.name for channel in spec.channels
     )
-    is_log = spec.source == "table"
+    is_log = spec.source == LOG
     return len(torque_columns(spec)) > 0 and (is_log or not measures_contact)

@@ -7,13 +7,14 @@
 ``calibrate`` finds b and p from the maxima of nominal episodes: of the alarms in them that the promised rate allows,
 values raise half and changes half. Each then has the threshold that it would have by itself for half of the rate.
 
-Where less than two alarms are allowed, thresholds at the largest maxima, C_1 and V_1, would raise up to two. There b
-makes the second largest maxima equal, C_2 = b V_2^p, and the threshold is the largest maximum of s times
+Where less than two alarms are allowed, thresholds at the largest maxima, C_1 and V_1, would raise up to two. There
+changes pass above T_C and values above T_V, each raised by how far the largest of the other is above its second:
 
-    margin = min(C_1/C_2, (V_1/V_2)^p)      changes pass at C_1 (V_1/V_2)^p, values at V_1 (C_1/C_2)^(1/p)
+    T_C = C_1 (V_1/V_2)^p      T_V^p = V_1^p C_1/C_2      ratios beyond ``MOST_MARGIN`` count as that
 
-By b of all n + 1 episodes, a fresh one that passes would be the first of all: one of n + 1 is, on average (full
-conformal prediction, Vovk et al. 2005; p, which also depends on the episodes, is taken as given).
+T_C = b T_V^p, and the threshold is the largest maximum of s times ``margin``, the smaller ratio. By a b that makes the
+second largest of all n + 1 episodes equal, a fresh one that passes would be the first of all: one of n + 1 is, on
+average (full conformal prediction, Vovk et al. 2005; p, which also depends on the episodes, is taken as given).
 
 A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
 a tenth of a second count as one.
@@ -56,6 +57,7 @@ PRIOR_COUNT = 4  # maxima that p rests on before any
 PRIOR_SPREAD_OF_CHANGES = 0.3  # of the logarithms of these
 PRIOR_SPREAD_OF_VALUES = 0.15
 MOST_POWER = 3.0
+MOST_MARGIN = 2.0  # by which a threshold is raised at most, in units of the surprise of changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,18 +151,27 @@ class ValueJudge:
         variance_of_values = _variance(by_values, PRIOR_SPREAD_OF_VALUES)
         ratio = np.sqrt(variance_of_changes / variance_of_values)
         power = min(float(ratio), MOST_POWER)
-        largest_changes = np.sort(by_changes)[::-1]
-        largest_values = power * np.sort(by_values)[::-1]
+        changes_down = np.sort(by_changes)[::-1]
+        values_down = power * np.sort(by_values)[::-1]
         half = int(expected / 2 + ROUNDING)
         count = len(by_changes)
         place = min(half or 2, count) - 1
-        margin = 1.0
+        level_of_changes = changes_down[place]
+        level_of_values = values_down[place]
+        margin = 0.0
         if half == 0 and count < FEWEST_IN_TAIL:
-            gap_of_changes = largest_changes[0] - largest_changes[place]
-            gap_of_values = largest_values[0] - largest_values[place]
-            margin = float(np.exp(min(gap_of_changes, gap_of_values)))
-        log_balance = largest_changes[place] - largest_values[place]
-        return replace(self, balance=float(np.exp(log_balance)), power=power, margin=margin)
+            most = np.log(MOST_MARGIN)
+            gap_of_changes = min(changes_down[0] - changes_down[place], most)
+            gap_of_values = min(values_down[0] - values_down[place], most)
+            level_of_changes = changes_down[0] + gap_of_values
+            level_of_values = values_down[0] + gap_of_changes
+            margin = min(gap_of_changes, gap_of_values)
+        return replace(
+            self,
+            balance=float(np.exp(level_of_changes - level_of_values)),
+            power=power,
+            margin=float(np.exp(margin)),
+        )
 
     def raised(self, scores: Sequence[Surprise]) -> list[Surprise]:
         """Return the surprise of the calibration set, its largest row raised by the margin."""
@@ -195,12 +206,15 @@ class ValueJudge:
         new, values = self.monitor.observe(state, rows)
         return new, self._joined(changes, values, spread, divisor)
 
-    def join_episode(self, episode: Episode, changes: Surprise, divisor: Floats) -> Surprise:
-        """Return what ``join`` returns for one row after another of an episode of T rows, ``divisor`` being (T,)."""
+    def join_episode(
+        self, stream: NDArray[np.float32], changes: Surprise, divisor: Floats
+    ) -> Surprise:
+        """Return what ``join`` returns for one row after another of a stream (T, D), ``divisor`` being (T,)."""
+        episode = Episode.from_stream(stream, self.monitor.spec)
         (values,) = self.monitor.score_episodes([episode])
-        spread = np.ones(len(episode))
+        spread = np.ones(len(stream))
         if len(self.leverage):
-            for part in stretches(self._senses, episode.stream, 2 * self._senses.lag):
+            for part in stretches(self._senses, stream, 2 * self._senses.lag):
                 spread[part.rows] = self._spread(part.reading, part.known)[part.lead :]
         return self._joined(changes, values, spread, divisor)
 
