@@ -27,7 +27,9 @@ def servo_run(rng):
 @pytest.fixture(scope="module")
 def runs():
     rng = np.random.default_rng(0)
-    return Episode.from_tables([servo_run(rng) for _ in range(40)], rate=10.0)
+    tables = [servo_run(rng) for _ in range(40)]
+    tables[20]["position"][60:, 0] *= -1  # a jerk, as large as no servo's heat can surprise
+    return Episode.from_tables(tables, rate=10.0)
 
 
 @pytest.fixture(scope="module")
