@@ -14,7 +14,8 @@ with the speed c, an impulse counts
     min(1, T c / g)                       T: what it takes to brake
 
 since a point that would not touch within T can still be braked. It counts in full also where it only grazes: MuJoCo's
-friction answers to all of its speed. Beyond its share the motors slow the arm down,
+friction answers to all of its speed. Links but the hand never slide along things in healthy episodes, and theirs count
+in full within a millimetre of something. Beyond its share the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -59,6 +60,7 @@ SOON_S = 0.03  # T
 DRIVEN_S = 0.01  # motors drive an arm on for so long while it is stopped [s]
 SURE_GAP = 2e-3  # curved surfaces may be nearer by so much than their nearest points were [m]
 LEAST_GAP = 1e-4  # no distance is divided by less [m]
+GRAZES = 1e-3  # a link but the hand that is so near to something may touch it [m]
 SLIDES = 0.005  # a point that comes nearer by less slides along [m/s]
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
@@ -149,6 +151,8 @@ def approach_of(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> App
             origin = views.subtree_com[arm.root]
             x, y, z = velocity_at(views.cvel[arm.links[n]], work.place, origin)
             soon = how_soon(point.way, gap, x, y, z)
+            if n > 0 and gap < GRAZES and soon == 0.0:
+                soon = 1.0
             if soon > 0.0:
                 momentum = point_momentum(views, arm, n, work.place, work)
                 soonest = max(soonest, soon)
