@@ -35,8 +35,8 @@ FASTEST_EPISODES = 0.05
 ODD_EPISODES = 0.002
 """and of all episodes: of hundreds, an odd one sets no speed where few others go."""
 
-MOMENTUM = 2.5
-"""Limit of a hand or link where no healthy hand was: 17 kg at the usual speed [N s]. MuJoCo's contacts answer with
+MOMENTUM = 2.3
+"""Limit of a hand or link where no healthy hand was: 15 kg at the usual speed [N s]. MuJoCo's contacts answer with
 about 105/s times that."""
 PACE_MOMENTUM = 3.0  # where one was [N s]
 
