@@ -9,12 +9,13 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from asm_gym.evaluation.statistics import Estimate
 from asm_gym.exceptions import UnsupportedEnvironment
+from asm_gym.guard.step_info import LazyInfo
 from asm_gym.rollouts.executed_sac import ExecutedSAC
-from asm_gym.rollouts.learner_vector import LearnerVector
+from asm_gym.rollouts.learner_vector import LearnerVector, of_each
 from asm_gym.rollouts.learning_record import LearningRecord
 from asm_gym.rollouts.priced_cost import Lagrangian, PricedCost
 from asm_gym.rollouts.safety_callback import FIRST_STEPS, SafetyCallback
@@ -64,6 +65,22 @@ def test_the_learner_meets_the_same_alarms_in_a_vector_as_in_single_environments
     assert min(costs[0]) > 0
 
 
+def test_what_the_guard_reports_is_made_only_when_it_is_read():
+    reads = []
+
+    def make():
+        reads.append(1)
+        return {"threshold": np.array([1.0, 2.0])}
+
+    asm = LazyInfo(make)
+    asm["slowed"] = np.array([0.0, 0.5])
+    members = of_each({"asm": asm, "cost": np.array([0.0, 1.0])}, 2)
+    assert members[1]["cost"] == 1.0
+    assert members[1]["asm"]["slowed"] == 0.5
+    assert not reads
+    assert [member["asm"]["threshold"] for member in members] == [1.0, 2.0]
+
+
 def test_another_autoreset_mode_is_refused():
     with pytest.raises(UnsupportedEnvironment, match="NEXT_STEP"):
         LearnerVector(SyncVectorEnv([FakeEnv]))
@@ -81,8 +98,19 @@ def test_sac_stores_what_the_guard_executed():
     assert not held.all()
 
 
+def test_sac_learns_in_a_guarded_vector_with_scaled_observations():
+    guarded = VectorNeuralASMSafety(vector(8, 8), FadingMonitor((2,)), on_alarm="hold")
+    scaled = VecNormalize(LearnerVector(guarded), norm_reward=False)
+    agent = ExecutedSAC("MlpPolicy", scaled, learning_starts=100, seed=0, buffer_size=64)
+    agent.learn(16)
+    held = (agent.replay_buffer.actions[:8, :, :2] == 0).all(axis=2)  # the third is the grip
+    assert held.any()
+    assert not held.all()
+
+
+@pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("many", [False, True])
-def test_actions_changed_outside_the_guard_are_refused(many):
+def test_actions_changed_outside_the_guard_are_refused(many, scaled):
     if many:
         rescaled = gym.wrappers.vector.RescaleAction(
             VectorNeuralASMSafety(vector(8, 8), FadingMonitor((2,)), on_alarm="monitor"), -2.0, 2.0
@@ -91,6 +119,11 @@ def test_actions_changed_outside_the_guard_are_refused(many):
     else:
         guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="hold")
         envs = RescaleAction(guarded, -2.0, 2.0)
+    if scaled:
+        if not many:
+            single = envs
+            envs = DummyVecEnv([lambda: single])
+        envs = VecNormalize(envs)
     with pytest.raises(UnsupportedEnvironment, match="RescaleAction outside the guard"):
         ExecutedSAC("MlpPolicy", envs)
 

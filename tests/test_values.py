@@ -74,11 +74,30 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
     assert (np.max(most, axis=0) < 1.1).all()
 
 
+TWO_NUMBERS = Episode.from_table({"q": np.zeros((9, 2))}, rate=10.0).spec
+
+
+class Drawn:
+    """A monitor whose surprise of each episode, of one row, is drawn before."""
+
+    def __init__(self, values):
+        self.spec = TWO_NUMBERS
+        self.scores = surprises(values)
+
+    def score_episodes(self, episodes):
+        return self.scores
+
+
+def surprises(values):
+    """Return surprise of one row for each value."""
+    return [Surprise(np.array([value]), np.zeros((1, 2))) for value in values]
+
+
 @settings(deadline=None)
 @given(
     centre=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
     spread=st.tuples(st.floats(0.2, 1.0), st.floats(0.2, 1.0)),
-    expected=st.floats(1, 40),
+    expected=st.floats(2, 40),
     seed=st.integers(0, 99),
 )
 def test_values_pass_the_threshold_as_often_as_changes_do(centre, spread, expected, seed):
@@ -86,23 +105,37 @@ def test_values_pass_the_threshold_as_often_as_changes_do(centre, spread, expect
     changes, values = (
         np.exp(c + s * rng.normal(size=400)) for c, s in zip(centre, spread, strict=True)
     )
-    spec = Episode.from_table({"q": np.zeros((9, 2))}, rate=10.0).spec
-
-    class Told:
-        def __init__(self):
-            self.spec = spec
-
-        def score_episodes(self, episodes):
-            return [Surprise(np.array([v]), np.zeros((1, 2))) for v in values]
-
-    scores = [Surprise(np.array([c]), np.zeros((1, 2))) for c in changes]
-    now = ValueJudge(Told(), np.zeros((0, 0))).balanced(scores, [], expected)
+    judge = ValueJudge(Drawn(values), np.zeros((0, 0)))
+    now = judge.balanced(surprises(changes), [], expected)
     weighted = now.balance * values**now.power
-    half = max(1, round(expected / 2))
+    half = int(expected / 2)
     threshold = np.sort(changes)[-half]
     assert (weighted >= threshold * (1 - 1e-9)).sum() == half
     if spread[0] < 2.5 * spread[1]:
         assert np.log(weighted).std() == pytest.approx(np.log(changes).std(), rel=0.1)
+
+
+@pytest.mark.parametrize("tail", ["normal", "exponential", "heavy", "alike"])
+@pytest.mark.parametrize(("episodes", "expected"), [(6, 1), (11, 1), (11, 3), (30, 1)])
+def test_values_and_changes_together_raise_no_more_than_is_promised(tail, episodes, expected):
+    rng = np.random.default_rng(episodes)
+    fresh = []
+    for _ in range(1000):
+        spread = {
+            "normal": rng.normal(size=(2, episodes + 1)),
+            "exponential": rng.exponential(size=(2, episodes + 1)),
+            "heavy": rng.standard_t(4, size=(2, episodes + 1)),
+            "alike": rng.normal(size=episodes + 1) + 0.5 * rng.normal(size=(2, episodes + 1)),
+        }[tail]
+        changes, values = np.exp([[0.3], [0.15]] * spread)
+        judge = ValueJudge(Drawn(values[:-1]), np.zeros((0, 0)))
+        judge = judge.balanced(surprises(changes[:-1]), [], expected)
+        joined = np.maximum(changes, judge.balance * values**judge.power)
+        raised = [score.value[0] for score in judge.raised(surprises(joined[:-1]))]
+        fresh.append(joined[-1] > np.sort(raised)[-expected])
+    promised = expected / (episodes + 1)
+    error = np.sqrt(promised * (1 - promised) / len(fresh))
+    assert np.mean(fresh) < 1.1 * promised + 2 * error
 
 
 def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_is_not():
@@ -136,6 +169,10 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     assert np.argmax(score.attribution[-1]) == 4
     values = asm.values_
     assert values is not None
+    nominal = asm.score_episodes(cut[30:45])
+    largest = max(score.value.max() for score in nominal)
+    assert asm.threshold == pytest.approx(values.margin * largest)  # one alarm is allowed
+    assert values.margin > 1
     body = values.balance * values.monitor.score(faulty[0]).value ** values.power
     assert (score.value >= body - 1e-9).all()
 

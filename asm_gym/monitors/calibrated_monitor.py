@@ -282,7 +282,7 @@ class CalibratedMonitor:
         self, episodes: Sequence[Episode], rate: AlarmRate, groups: Sequence[str]
     ) -> None:
         """Set the threshold for a rate of alarms in these episodes, and in each of their groups."""
-        surprises = self.score_episodes(episodes)
+        surprises = self._calibration_scores(episodes)
         values = [surprise.value for surprise in surprises]
         blocks = Blocks.of(values, self.spec.dt, groups)
         blocks = blocks_of_incidents(blocks, surprises, self, groups)
@@ -343,6 +343,10 @@ class CalibratedMonitor:
     def _balanced(self, episodes: Sequence[Episode], rate: AlarmRate) -> Self:
         """Return a copy in which several judgements share the rate in nominal episodes; itself with just one."""
         return self
+
+    def _calibration_scores(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        """Return the surprise of the nominal episodes that set the threshold."""
+        return self.score_episodes(episodes)
 
     @typed
     def initial_state(self, batch: int = 1) -> MonitorState:

@@ -81,9 +81,9 @@ class AlarmRate(NamedTuple):
         return self.expected(episodes) >= 1.0
 
     def expected(self, episodes: Sequence[Episode]) -> float:
-        """Return how many alarms in these nominal episodes the rate allows."""
+        """Return how many alarms the rate allows in these nominal episodes and a fresh one."""
         if self.per == EPISODE:
-            return self.rate * len(episodes)
+            return self.rate * (len(episodes) + 1)
         return self.rate * sum(len(e) * e.spec.dt for e in episodes) / 3600
 
     def check_hours(self, hours: float) -> None:

@@ -330,6 +330,12 @@ class NeuralASM(CalibratedMonitor):
         other.values_ = self.values_.balanced(by_changes, episodes, expected)
         return other
 
+    def _calibration_scores(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        scores = self.score_episodes(episodes)
+        if self.values_ is None:
+            return scores
+        return self.values_.raised(scores)
+
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         super()._learn(episodes, progress, warm_start)
         self.values_ = None

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorActionWrapper
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from asm_gym.control_period import layers
 from asm_gym.exceptions import UnsupportedEnvironment
@@ -77,12 +77,10 @@ def refuse_changed_actions(envs: VecEnv | None) -> None:
                 changes = type(layer).__name__
 
 
-def members_of(envs: Any) -> list[Any]:
+def members_of(envs: VecEnv | None) -> list[Any]:
     """Return the environments in a learner's vector; none where they cannot be looked into."""
-    while envs is not None:
-        if isinstance(envs, LearnerVector):
-            return [envs.envs]
-        if hasattr(envs, "envs"):
-            return list(envs.envs)
-        envs = getattr(envs, "venv", None)  # what a wrapper of stable-baselines3 wraps
-    return []
+    while isinstance(envs, VecEnvWrapper):  # it also has the attributes of what it wraps
+        envs = envs.venv
+    if isinstance(envs, LearnerVector):
+        return [envs.envs]
+    return list(getattr(envs, "envs", ()))

@@ -118,10 +118,11 @@ def of_each(infos: dict[str, Any], count: int) -> list[dict[str, Any]]:
     members = [{name: values[n] for name, values in arrays.items()} for n in range(count)]
     asm = infos.get("asm")
     if asm is not None:
-        known = dict.copy(asm)  # without the rest, which ``asm`` makes when it is read
+        # ``dict.copy`` would read ``asm``, and so make the rest
+        written = list(dict.items(asm))
         for n, member in enumerate(members):
             member["asm"] = LazyInfo(partial(_of_member, asm, n))
-            for name, values in known.items():
+            for name, values in written:
                 member["asm"][name] = _of_member(values, n)
     return members
 

@@ -6,7 +6,15 @@
 
 ``calibrate`` finds b and p from the maxima of nominal episodes: of the alarms in them that the promised rate allows,
 values raise half and changes half. Each then has the threshold that it would have by itself for half of the rate.
-Where less than two alarms are allowed, each has its largest maximum: together they may raise up to twice the rate.
+
+Where less than two alarms are allowed, thresholds at the largest maxima, C_1 and V_1, would raise up to two. There b
+makes the second largest maxima equal, C_2 = b V_2^p, and the threshold is the largest maximum of s times
+
+    margin = min(C_1/C_2, (V_1/V_2)^p)      changes pass at C_1 (V_1/V_2)^p, values at V_1 (C_1/C_2)^(1/p)
+
+By b of all n + 1 episodes, a fresh one that passes would be the first of all: one of n + 1 is, on average (full
+conformal prediction, Vovk et al. 2005; p, which also depends on the episodes, is taken as given).
+
 A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
 a tenth of a second count as one.
 """
@@ -24,6 +32,7 @@ from asm_gym.blas import ONE_THREAD
 from asm_gym.data.episode import Episode
 from asm_gym.detection import Blocks, ModelOutput
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.conformal import FEWEST_IN_TAIL, ROUNDING
 from asm_gym.detection.evidence import TINY
 from asm_gym.detection.scores import Largest
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
@@ -59,6 +68,7 @@ class ValueJudge:
         usual: 1 / (1 + τ h̃).
         balance: b; 1 before ``calibrate``.
         power: p; before ``calibrate`` 2, as changes are judged by squares.
+        margin: by which the largest surprise of the calibration set counts for more, >= 1; not kept in a checkpoint.
     """
 
     monitor: CalibratedMonitor
@@ -66,6 +76,7 @@ class ValueJudge:
     usual: float = 1.0
     balance: float = 1.0
     power: float = 2.0
+    margin: float = 1.0
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self | None:
@@ -125,12 +136,12 @@ class ValueJudge:
     def balanced(
         self, changes: Sequence[Surprise], episodes: Sequence[Episode], expected: float
     ) -> Self:
-        """Return it with b and p from nominal episodes.
+        """Return it with b, p and the margin from nominal episodes.
 
         Args:
             changes: surprise of these episodes by changes alone.
             episodes: nominal.
-            expected: alarms in them that the promised rate allows.
+            expected: alarms that the promised rate allows in them and a fresh one.
         """
         by_changes = self._log_maxima(changes)
         by_values = self._log_maxima(self.monitor.score_episodes(episodes))
@@ -138,9 +149,27 @@ class ValueJudge:
         variance_of_values = _variance(by_values, PRIOR_SPREAD_OF_VALUES)
         ratio = np.sqrt(variance_of_changes / variance_of_values)
         power = min(float(ratio), MOST_POWER)
-        place = -max(1, min(round(expected / 2), len(by_changes)))
-        log_balance = np.sort(by_changes)[place] - power * np.sort(by_values)[place]
-        return replace(self, balance=float(np.exp(log_balance)), power=power)
+        largest_changes = np.sort(by_changes)[::-1]
+        largest_values = power * np.sort(by_values)[::-1]
+        half = int(expected / 2 + ROUNDING)
+        count = len(by_changes)
+        place = min(half or 2, count) - 1
+        margin = 1.0
+        if half == 0 and count < FEWEST_IN_TAIL:
+            gap_of_changes = largest_changes[0] - largest_changes[place]
+            gap_of_values = largest_values[0] - largest_values[place]
+            margin = float(np.exp(min(gap_of_changes, gap_of_values)))
+        log_balance = largest_changes[place] - largest_values[place]
+        return replace(self, balance=float(np.exp(log_balance)), power=power, margin=margin)
+
+    def raised(self, scores: Sequence[Surprise]) -> list[Surprise]:
+        """Return the surprise of the calibration set, its largest row raised by the margin."""
+        worst = int(np.argmax([score.value.max() for score in scores]))
+        raised = list(scores)
+        value = scores[worst].value.copy()
+        value[value.argmax()] *= self.margin
+        raised[worst] = scores[worst]._replace(value=value)
+        return raised
 
     def _log_maxima(self, scores: Sequence[Surprise]) -> Floats:
         """Return the logarithms (n,) of the maxima of blocks."""
