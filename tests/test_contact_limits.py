@@ -204,26 +204,21 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
     assert 0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)
 
 
-def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_healthy_hand_was(
-    lift, surrounded
-):
-    def most(action, pace):
-        """The greatest momentum [N s] and speed [m/s] of a hand that is driven by an action for three seconds."""
+def test_an_arm_that_is_stretched_out_has_no_more_momentum_than_it_may(lift, surrounded):
+    def most(pace):
+        """The greatest momentum of a hand that is driven forwards for three seconds [N s]."""
         lift.reset(seed=0)
         simulation = lift.unwrapped.simulation
         lift.unwrapped.contact_limits = ContactLimits(1e3, 1e3, pace=pace)
         found = []
         for _ in range(60):
-            lift.step(np.float32(action))
-            twist = present_twist(simulation, 0)
-            found.append((hand_momentum(simulation, 0, twist), np.linalg.norm(twist[:3])))
-        return np.max(found, axis=0)
+            lift.step(np.float32([1, 0, -0.3, 0, 0, 0, 0]))
+            found.append(hand_momentum(simulation, 0, present_twist(simulation, 0)))
+        return max(found)
 
     momentum = 2.0
     elsewhere = HandSpeedMap(np.array([[0, 20, 20, 20, *[0.1] * 12]]), momentum)
-    forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
-    assert most(forward, elsewhere)[0] < 1.2 * momentum < most(forward, None)[0] / 1.5
-    assert most(sideways, elsewhere)[1] > 1.1 * most(forward, elsewhere)[1]
+    assert most(elsewhere) < 1.2 * momentum < most(None) / 1.5
 
 
 def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():
@@ -287,13 +282,10 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
     for soon, speed in ((0.8, 0.15 / 0.8), (0.1, 0.3), (0.0, 0.3)):
         free = most(0, 0, -0.6, 0, 0, 0, place=here - 0.1, soon=soon)
         assert free == pytest.approx(speed / 0.6)
-    # what is behind it counts; in a task that is known it does not
-    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) < 0.1
-    known = HandSpeedMap.of({"Lift": HandSpeedMap.learned([stream], spec)}, "Lift")
-    limits = ContactLimits(pace=known)
-    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(0.15 / 0.3)
-    # but where no healthy hand went down
-    assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2
+    # what is behind it counts, less where a healthy hand went
+    there = most(0, 0, -0.3, 0, 0, 0, momentum=9.0)
+    elsewhere = most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=9.0)
+    assert elsewhere < there < 0.4
     assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == 0.5
     assert HandSpeedMap.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
     for bad in (

@@ -147,4 +147,4 @@ def test_an_arm_is_slowed_down_on_its_way_to_the_table_and_not_away_from_it(lift
     assert braked[0] == 0.0
     assert max(braked) > 0.5
     assert risen > 0.1
-    assert max(away[8:]) == 0.0
+    assert max(away[10:]) == 0.0

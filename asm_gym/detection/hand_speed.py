@@ -6,7 +6,7 @@ Near a place where healthy hands went at most as fast as g along each axis, a ha
 
 v (6,) is a twist, linear then angular [m/s], [rad/s]; |v| the speed of the hand's fastest point [m/s]. L' is the usual
 limit L, up to twice as much the farther away everything is. p is the momentum of the arm on its way to
-something [N s], P its limit where no healthy hand was and P' where one was: none in a task that is known. Downwards,
+something [N s], P its limit where no healthy hand was and P' where one was. Downwards,
 where what a hand meets is hard, k allows at most L, and at most 1.05 times the speed of healthy hands. In tasks whose
 healthy hands point down all the time, k counts only for hands that do so: one that is tilted meets things with other
 parts.

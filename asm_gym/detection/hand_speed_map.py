@@ -35,10 +35,10 @@ FASTEST_EPISODES = 0.05
 ODD_EPISODES = 0.002
 """and of all episodes: of hundreds, an odd one sets no speed where few others go."""
 
-MOMENTUM_OF_KNOWN_TASK = 2.0
-"""Limit of a hand or link where no healthy hand was, in a task with a map of its own: 13 kg at the usual speed [N s].
-MuJoCo's contacts answer with at most 105/s times that."""
-MOMENTUM = 2.5  # the limit in other tasks, everywhere [N s]
+MOMENTUM = 2.3
+"""Limit of a hand or link where no healthy hand was: 15 kg at the usual speed [N s]. MuJoCo's contacts answer with
+about 105/s times that."""
+PACE_MOMENTUM = 3.0  # where one was [N s]
 
 TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
 TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
@@ -51,7 +51,7 @@ class HandSpeedMap:
     Args:
         cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of the momentum of an arm's hand and links, where no healthy hand was [N s].
-        pace_momentum: the same where one was; infinite in a task that is known.
+        pace_momentum: the same where one was [N s].
 
     Raises:
         ValueError: cells of another shape, places that are too far away, or negative speeds.
@@ -66,7 +66,7 @@ class HandSpeedMap:
         self,
         cells: AnyFloats,
         momentum: float = MOMENTUM,
-        pace_momentum: float = MOMENTUM,
+        pace_momentum: float = PACE_MOMENTUM,
     ) -> None:
         if not _are_cells(cells):
             raise ValueError(
@@ -103,7 +103,7 @@ class HandSpeedMap:
     ) -> Self | None:
         """Return the map of a task; that of all tasks where it has none, None where there are no cells."""
         if task and task in cells_by_task:
-            return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK, np.inf)
+            return cls(cells_by_task[task])
         if not cells_by_task:
             return None
         return cls(np.concatenate(list(cells_by_task.values())))

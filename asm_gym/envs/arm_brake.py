@@ -7,13 +7,15 @@ Of its present motion q̇ an arm may have the share s, the least of
 
 where the momentum p is the largest of the impulses |Λ v| that stop a point of a link which is near something
 (``obstacles``), as far as it counts; Λ⁻¹ = J M⁻¹ Jᵀ. Such an impulse is what a link pushes with that meets something
-hard and does not slide, be it a forearm on the robot's own pedestal. At a distance g, approached with the speed c, it
-counts
+hard and does not slide, be it a forearm on the robot's own pedestal. v is the point's velocity after another hundredth
+of a second of what the motors do now, since they drive the arm on while it is stopped. At a distance g, approached
+with the speed c, an impulse counts
 
     min(1, T c / g)                       T: what it takes to brake
 
 since a point that would not touch within T can still be braked. It counts in full also where it only grazes: MuJoCo's
-friction answers to all of its speed. Beyond its share the motors slow the arm down,
+friction answers to all of its speed. Links but the hand never slide along things in healthy episodes, and theirs count
+in full within a millimetre of something. Beyond its share the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -32,6 +34,7 @@ import numpy as np
 from asm_gym.compilation import inner
 from asm_gym.detection.hand_speed import SpeedLimit, paced_share, usual_share
 from asm_gym.envs.controllers import (
+    backward,
     cholesky,
     command,
     forward,
@@ -51,10 +54,13 @@ from asm_gym.envs.mujoco_views import (
     Views,
     Work,
 )
+from asm_gym.envs.obstacles import LOOK_AGAIN_EVERY, look_again
 
 SOON_S = 0.03  # T
+DRIVEN_S = 0.01  # motors drive an arm on for so long while it is stopped [s]
 SURE_GAP = 2e-3  # curved surfaces may be nearer by so much than their nearest points were [m]
 LEAST_GAP = 1e-4  # no distance is divided by less [m]
+GRAZES = 1e-3  # a link but the hand that is so near to something may touch it [m]
 SLIDES = 0.005  # a point that comes nearer by less slides along [m/s]
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
@@ -145,6 +151,8 @@ def approach_of(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> App
             origin = views.subtree_com[arm.root]
             x, y, z = velocity_at(views.cvel[arm.links[n]], work.place, origin)
             soon = how_soon(point.way, gap, x, y, z)
+            if n > 0 and gap < GRAZES and soon == 0.0:
+                soon = 1.0
             if soon > 0.0:
                 momentum = point_momentum(views, arm, n, work.place, work)
                 soonest = max(soonest, soon)
@@ -181,7 +189,7 @@ def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
 
 @partial(inner, inlined=True)
 def point_momentum(views: Views, arm: Arm, n: int, place: Floats, work: Work) -> float:
-    """Return |Λ v|, what stops a link at a place (3,) [N s]."""
+    """Return |Λ v|, what stops a link at a place (3,) a moment on [N s]."""
     origin = views.subtree_com[arm.root]
     velocity = work.momentum
     x, y, z = velocity_at(views.cvel[arm.links[n]], place, origin)
@@ -198,6 +206,8 @@ def point_momentum(views: Views, arm: Arm, n: int, place: Floats, work: Work) ->
             rows[0, i] = x
             rows[1, i] = y
             rows[2, i] = z
+            for axis in range(3):
+                velocity[axis] += rows[axis, i] * work.gained[i]
     for axis in range(3):
         forward(work.factor, arm.joint_count, rows[axis])
     inner_products(rows, 3, arm.joint_count, work.products)
@@ -243,6 +253,17 @@ def write_twist(arm: Arm, work: Work) -> None:
 
 
 @partial(inner, inlined=True)
+def write_gained(views: Views, arm: Arm, goal: Goal, work: Work) -> None:
+    """Write the speed that the motors add to the joints within ``DRIVEN_S``, by the factor of their mass matrix."""
+    n = arm.joint_count
+    for i in range(n):
+        drive = views.ctrl[arm.motors[i]] - work.bias[i]
+        work.gained[i] = DRIVEN_S * (1.0 - goal.drive_lost) * drive
+    forward(work.factor, n, work.gained)
+    backward(work.factor, n, work.gained)
+
+
+@partial(inner, inlined=True)
 def slow_down(
     views: Views, arm: Arm, goal: Goal, a: int, limits: SubstepLimits, work: Work
 ) -> bool:
@@ -264,6 +285,9 @@ def slow_down(
     approach = Approach(soon=1.0, momentum=0.0, leans=False)
     if limit.momentum < np.inf:
         cholesky(work.mass, arm.joint_count, work.factor)
+        write_gained(views, arm, goal, work)
+        if limits.status[0].substeps % LOOK_AGAIN_EVERY == 0:
+            look_again(views, arm, a, limits.ahead, work.ends)
         approach = approach_of(views, arm, a, limits.ahead, work)
     share = share_at(views, arm, a, limit, work.twist, approach)
     share = min(share, speed_limit / speed)

@@ -99,6 +99,16 @@ def forward(L: Floats, n: int, b: Floats) -> None:
 
 
 @inner
+def backward(L: Floats, n: int, b: Floats) -> None:
+    """b ← L⁻ᵀ b (n,); 0 where a row of L is."""
+    for i in range(n - 1, -1, -1):
+        entry = b[i]
+        for k in range(i + 1, n):
+            entry -= L[k, i] * b[k]
+        b[i] = divided(entry, L[i, i])
+
+
+@inner
 def solve(M: Floats, n: int, L: Floats, b: Floats) -> None:
     """b ← M⁻¹ b (n,), where L is scratch.
 
@@ -106,11 +116,7 @@ def solve(M: Floats, n: int, L: Floats, b: Floats) -> None:
     """
     cholesky(M, n, L)
     forward(L, n, b)
-    for i in range(n - 1, -1, -1):
-        entry = b[i]
-        for k in range(i + 1, n):
-            entry -= L[k, i] * b[k]
-        b[i] = divided(entry, L[i, i])
+    backward(L, n, b)
 
 
 @inner

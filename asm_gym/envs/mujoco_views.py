@@ -161,6 +161,8 @@ class Work(NamedTuple):
     products: Floats  # (JOINTS, JOINTS) J M⁻¹ Jᵀ, and below it J M⁻¹ p
     rotations: Floats  # (3, 3, 3) frames on the way to a set-point
     twist: Floats  # (6,) of the hand [m/s], [rad/s]
+    gained: Floats  # (JOINTS,) speed that the motors are about to add [rad/s]
+    ends: Floats  # (2, 3) the nearest points of two geoms [m]
     place: Floats  # (3,) of a point of a link [m]
     momentum: Floats  # (3,) of it [N s]
     inverse_mass: Floats  # (3, 3) a factor of that of a link [1/kg]
@@ -185,6 +187,8 @@ class Work(NamedTuple):
             products=np.zeros(square),
             rotations=np.zeros((3, 3, 3)),
             twist=np.zeros(6),
+            gained=np.zeros(JOINTS),
+            ends=np.zeros((2, 3)),
             place=np.zeros(3),
             momentum=np.zeros(3),
             inverse_mass=np.zeros((3, 3)),
@@ -212,9 +216,11 @@ NEAR_POINT = np.dtype(
         ("in_link", np.float64, 3),  # the same in the link's frame
         ("way", np.float64, 3),  # from there to the obstacle, a unit vector
         ("gap", np.float64),  # how far it was [m]
+        ("geom", np.int64),  # of the link
+        ("obstacle", np.int64),  # a geom
     ]
 )
-"""Where a link is near an obstacle, as a control step began."""
+"""Where a link was near an obstacle, when that was looked for last."""
 
 
 class Ahead(NamedTuple):

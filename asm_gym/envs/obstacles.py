@@ -1,9 +1,10 @@
 """Where an arm might meet something: only towards it is the arm slowed down more than elsewhere.
 
 Around each geom of the arm there is a ball, and around each geom of anything else a box. Of pairs whose ball and box
-are within ``NEAR``, MuJoCo tells the nearest points, in every control step; in every substep the place and the speed
-of the arm's point tell how soon they would touch (``arm_brake``). What the hand touches and can be carried belongs to
-the hand: it is no obstacle, and meets others.
+are within ``NEAR``, MuJoCo tells the nearest points, in every control step; of those that are nearest, in every fifth
+substep again, for a link that rolls on a table always touches it with another point. In every substep the place and
+the speed of the arm's point tell how soon they would touch (``arm_brake``). What the hand touches and can be carried
+belongs to the hand: it is no obstacle, and meets others.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from asm_gym.envs.mujoco_views import NEAR_POINTS, Ahead, Arm, Arms, Floats, Int
 # Beyond it nothing is touched within a control step of 50 ms at 1 m/s [m].
 NEAR = 0.06
 
+LOOK_AGAIN_EVERY = 5  # substeps
+LOOK_AGAIN_WITHIN = 0.02  # [m]
 WORLD = 0  # the body that all others stand on
 
 link_library()
@@ -176,7 +179,27 @@ def note_geom(arm: Any, geom: int, link: int, ahead: Ahead, a: int) -> None:
         if gap < NEAR:
             point = point_to_keep(ahead, a, link, gap)
             if point >= 0:
-                write_point(arm, arm.link_bodies[link], gap, ahead.points[a, link, point])
+                near = ahead.points[a, link, point]
+                near.geom = geom
+                near.obstacle = other
+                body = arm.link_bodies[link]
+                write_point(arm.body_places[body], arm.body_frames[body], arm.ends, gap, near)
+
+
+@inner
+def look_again(views: Any, arm: Any, a: int, ahead: Ahead, ends: Floats) -> None:
+    """Write anew where what was nearest to arm ``a`` is nearest now; see ``Views``, ``Arm``."""
+    n = 0
+    while arm.links[n] >= 0:
+        body = arm.links[n]
+        for k in range(ahead.counts[a, n]):
+            near = ahead.points[a, n, k]
+            if near.gap < LOOK_AGAIN_WITHIN:
+                gap = _distance(
+                    views.model, views.data, near.geom, near.obstacle, NEAR, ends.ctypes.data
+                )
+                write_point(views.xpos[body], views.xmat[body], ends, gap, near)
+        n += 1
 
 
 @inner
@@ -211,12 +234,21 @@ def point_to_keep(ahead: Ahead, a: int, link: int, gap: float) -> int:
 
 
 @inner
-def write_point(arm: Any, body: int, gap: float, point: Any) -> None:
-    """Write the point of a link, a body, from the nearest points ``arm.ends`` of one of its geoms and another."""
+def write_point(
+    body_place: Floats, body_frame: Floats, ends: Floats, gap: float, point: Any
+) -> None:
+    """Write the point of a link from the nearest points ``ends`` (2, 3) of one of its geoms and another.
+
+    Args:
+        body_place, body_frame: (3,) and (9,) of the link.
+        ends: see above.
+        gap: from one to the other; negative where the geoms overlap [m].
+        point: of ``NEAR_POINT``, written to.
+    """
     point.gap = gap
     for axis in range(3):
-        point.place[axis] = arm.ends[0, axis]
-        point.way[axis] = arm.ends[1, axis] - arm.ends[0, axis]
+        point.place[axis] = ends[0, axis]
+        point.way[axis] = ends[1, axis] - ends[0, axis]
     distance = length(point.way)
     if gap < 0.0:
         distance = -distance  # the nearest points of geoms that overlap lie the other way
@@ -225,5 +257,5 @@ def write_point(arm: Any, body: int, gap: float, point: Any) -> None:
             point.way[axis] /= distance
         point.in_link[axis] = 0.0
         for k in range(3):
-            from_link = point.place[k] - arm.body_places[body, k]
-            point.in_link[axis] += arm.body_frames[body, 3 * k + axis] * from_link
+            from_link = point.place[k] - body_place[k]
+            point.in_link[axis] += body_frame[3 * k + axis] * from_link
