@@ -128,6 +128,23 @@ def test_actions_changed_outside_the_guard_are_refused(many, scaled):
         ExecutedSAC("MlpPolicy", envs)
 
 
+def test_ppo_learns_from_its_own_actions_where_a_wrapper_rescales_them():
+    guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="monitor")
+    chosen = []
+    executed = []
+
+    def keep(local, _):
+        chosen.append(local["clipped_actions"][0])
+        executed.append(local["infos"][0]["asm"]["executed_action"])
+        return True
+
+    agent = PPO("MlpPolicy", RescaleAction(guarded, -2.0, 2.0), n_steps=8, batch_size=8, seed=0)
+    agent.learn(8, keep)
+    np.testing.assert_allclose(np.array(chosen) / 2, executed, rtol=1e-5)
+    learned_from = agent.rollout_buffer.actions.reshape(8, -1)
+    np.testing.assert_allclose(np.clip(learned_from, -2, 2), chosen)
+
+
 class HidesEnds(gym.Wrapper):
     def step(self, action):
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -245,7 +262,6 @@ def result(way, seed, harm, rewards, task="Reach"):
         "way": way,
         "seed": seed,
         "period": 0.05,
-        "seconds": 10.0,
         "processor_seconds": 20.0,
         "steps": 100 * count,
         "learning": episodes,

@@ -1,10 +1,12 @@
 """What strains an arm: contact force over time, joints at their stops, and a robot that touches itself."""
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
+from asm_gym.envs.arms import bodies
 from asm_gym.envs.strain import AT_STOP, GRIPPER, LINK, self_contacts
 from asm_gym.policies import make_policy, rollout
 
@@ -30,6 +32,53 @@ def test_the_impulse_is_the_force_beyond_forty_newtons_in_every_substep(stream_f
     assert expected > 1.0  # it rams the table
     assert reported == pytest.approx(expected)
     env.close()
+
+
+def net_force_on(own, model, data):
+    """Return the norm of the sum of all contact forces of bodies with others."""
+    total = np.zeros(3)
+    wrench = np.zeros(6)
+    for number, contact in enumerate(data.contact):
+        first, second = model.geom_bodyid[[contact.geom1, contact.geom2]]
+        if (first in own) != (second in own):
+            mujoco.mj_contactForce(model, data, number, wrench)
+            force = wrench[:3] @ contact.frame.reshape(3, 3)
+            total += force if second in own else -force
+    return np.linalg.norm(total)
+
+
+def test_what_the_gripper_and_a_cube_in_it_meet_counts_in_every_substep():
+    env = gym.make("asm_gym/Lift-v0", horizon=300, terminate_on_success=False)
+    arm = env.unwrapped
+    policy = make_policy("scripted", env, seed=0)
+    observation, info = env.reset(seed=0)
+    state = None
+    while not info["success"]:
+        action, state = policy.predict(observation, state, np.array([state is None]))
+        observation, *_, info = env.step(action)
+
+    simulation = arm.simulation
+    model = simulation.model
+    data = simulation.data
+    own = set(bodies(model, arm.robosuite_env.robots[0]).tolist())
+    cube = model.body("cube_main").id
+    table = model.body("table").id
+    reported = []
+    expected = []
+    meets_table = []
+
+    def compare(_):
+        reported.append(simulation.contact_forces[-1])
+        expected.append(net_force_on(own, model, data))
+        pairs = model.geom_bodyid[data.contact.geom]
+        meets_table.append(((pairs == cube).any(axis=1) & (pairs == table).any(axis=1)).any())
+
+    arm.substep_hooks.append(compare)
+    for _ in range(25):
+        env.step(DOWN)
+    env.close()
+    np.testing.assert_allclose(reported, expected, atol=1e-6)
+    assert max(np.array(reported)[meets_table]) > 100.0
 
 
 def test_a_joint_at_its_stop_counts():

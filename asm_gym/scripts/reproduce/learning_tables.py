@@ -61,7 +61,6 @@ def summary(result: Record) -> Record:
         "last_reward": last.reward.mean(),
         "last_success": last.success.mean(),
         "steps_to_target": steps_to_target(episodes, TARGETS[result["task"]]),
-        "steps_s": result["steps"] / result["seconds"],
         "processor_steps_s": result["steps"] / result["processor_seconds"],
     }
     for name, played in result["trained"].items():
@@ -190,7 +189,6 @@ def wear_table(frame: pd.DataFrame) -> Table:
                 "joints at stops, per 1,000 steps": cell(group.joint_stops, 1),
                 "contacts with itself, per 1,000 steps": cell(group.self_contacts, 1),
                 "in alarm [%]": cell(group.cost, 1, 100.0),
-                "steps a second": cell(group.steps_s),
                 "steps a second of processor time": cell(group.processor_steps_s),
             }
         )
@@ -215,18 +213,21 @@ def pace_table(paces: pd.DataFrame) -> Table:
 
 
 def curves_figure(points: Sequence[Record]) -> Figure:
-    """Draw reward and harm over steps, a row of panels for each task and algorithm."""
+    """Draw reward, success and harm over steps, with a band of a SD, a row of panels for each task and algorithm."""
     frame = pd.DataFrame(points)
     motions = list(frame.groupby(["task", "algorithm"], sort=False))
     with figure(height=0.5 + 2.3 * len(motions)) as fig:
-        axes = fig.subplots(len(motions), 2, squeeze=False, sharex=True)
-        for (left, right), ((task, algorithm), own) in zip(axes, motions, strict=True):
+        axes = fig.subplots(len(motions), 3, squeeze=False, sharex=True)
+        for (left, middle, right), ((task, algorithm), own) in zip(axes, motions, strict=True):
             kit.curves(left, own, "reward", "step", "way")
+            kit.curves(middle, own, "success", "step", "way")
             kit.curves(right, own, "harm", "step", "way")
-            left.set(title=f"{task}, {algorithm}", ylabel="reward of an episode", ylim=(0, None))
-            right.set(title="harm so far", ylabel="[N s]", yscale="log", ylim=(1, None))
+            left.set(title=f"{task}, {algorithm}: reward", ylim=(0, None))
+            middle.set(title="share solved", ylim=(0, 1))
+            right.set(title="harm so far [N s]", yscale="log", ylim=(1, None))
         for ax in axes[-1]:
             ax.set_xlabel("control steps")
+            ax.locator_params(axis="x", nbins=3)
         for ax in axes.ravel():
             ax.grid(axis="y")
         handles, labels = axes[0, 0].get_legend_handles_labels()
