@@ -8,7 +8,9 @@ import pytest
 
 from asm_gym.evaluation.contact_harm import harm_of
 from asm_gym.policies.hostile import HOSTILE
+from asm_gym.rollouts.trial import Trial
 from asm_gym.scripts.reproduce import harm
+from asm_gym.scripts.reproduce.harm_cases import Case
 from asm_gym.scripts.reproduce.kit import main
 
 ALONE, DEFAULT = "policy alone", "default"
@@ -132,3 +134,10 @@ def test_harm_is_drawn_against_pace_for_each_guard():
         ALONE: (1.0, 100.0),
         DEFAULT: (1.25, 2.0),
     }
+
+
+@pytest.mark.parametrize(("policy", "speed"), [("forward", 1.0), ("down", 0.5)])
+def test_a_hand_that_is_driven_onto_a_bin_where_healthy_hands_went_meets_it_gently(policy, speed):
+    trial = Trial("asm_gym/PickPlaceCan-v0", 71000)
+    found = harm.episode((Case("hostile", policy, trial, speed=speed), "default"))
+    assert 40.0 < found["peak"] < 280.0

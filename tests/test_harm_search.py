@@ -80,3 +80,43 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path):
     assert [record["square"] for record in found] == [0, 1, 4, 9, 16]
     assert done == [0, 1, 2, 3, 3, 4]
     assert list(tmp_path.iterdir()) == []  # another run begins anew
+
+
+FOREARM_ROLLS = Program(
+    scene=884,
+    expert_steps=59,
+    waits=True,
+    repeats=False,
+    segments=(
+        Segment(steps=19, motion=(0.0, -1.0, 0.0, 0.0, 0.0, 0.0), grip=0.0),
+        Segment(steps=47, motion=(0.0, -1.0, 0.0, 0.0, 1.0, -0.3266221731614227), grip=0.0),
+    ),
+)
+LINK_GRAZES = Program(
+    scene=747,
+    expert_steps=4,
+    waits=False,
+    repeats=False,
+    segments=(
+        Segment(
+            steps=36,
+            motion=(
+                -0.3031793328830368,
+                1.0,
+                -0.5963026699043733,
+                0.9951607840935307,
+                -0.14139299133996916,
+                -0.16496831430307995,
+            ),
+            grip=-1.0,
+        ),
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    ("task", "program"), [("Stack", FOREARM_ROLLS), ("NutAssemblySquare", LINK_GRAZES)]
+)
+def test_links_that_roll_on_a_table_or_graze_it_meet_it_gently(task, program):
+    """Each was beyond 430 N where nearest points were found once a step, or grazing points did not count."""
+    assert tried(Search(task, "Panda", "default", 0, 1), program)["force"] < 280.0

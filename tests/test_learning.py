@@ -262,7 +262,6 @@ def result(way, seed, harm, rewards, task="Reach"):
         "way": way,
         "seed": seed,
         "period": 0.05,
-        "seconds": 10.0,
         "processor_seconds": 20.0,
         "steps": 100 * count,
         "learning": episodes,

@@ -226,10 +226,8 @@ def learn(run: Run, folder: Path) -> Path:
     with vector(run.task, run.robot, run.envs, run.threads) as envs:
         record = recorded(envs, way)
         learner = make_learner(run.algorithm, record, way, run.seed)
-        wall = time.perf_counter()
         processor = time.process_time()
         learner.agent.learn(run.steps, learner.callbacks)
-        seconds = time.perf_counter() - wall
         processor_seconds = time.process_time() - processor
         period = float(envs.get_attr("dt")[0])
         rounds = math.ceil(run.evaluation_episodes / run.envs)
@@ -240,7 +238,6 @@ def learn(run: Run, folder: Path) -> Path:
     result = {
         **run.key,
         "period": period,
-        "seconds": seconds,
         "processor_seconds": processor_seconds,
         "steps": record.steps,
         "learning": columns(record.episodes),

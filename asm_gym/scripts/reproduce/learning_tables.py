@@ -61,7 +61,6 @@ def summary(result: Record) -> Record:
         "last_reward": last.reward.mean(),
         "last_success": last.success.mean(),
         "steps_to_target": steps_to_target(episodes, TARGETS[result["task"]]),
-        "steps_s": result["steps"] / result["seconds"],
         "processor_steps_s": result["steps"] / result["processor_seconds"],
     }
     for name, played in result["trained"].items():
@@ -190,7 +189,6 @@ def wear_table(frame: pd.DataFrame) -> Table:
                 "joints at stops, per 1,000 steps": cell(group.joint_stops, 1),
                 "contacts with itself, per 1,000 steps": cell(group.self_contacts, 1),
                 "in alarm [%]": cell(group.cost, 1, 100.0),
-                "steps a second": cell(group.steps_s),
                 "steps a second of processor time": cell(group.processor_steps_s),
             }
         )
