@@ -29,6 +29,7 @@ def runs():
     rng = np.random.default_rng(0)
     tables = [servo_run(rng) for _ in range(40)]
     tables[20]["position"][60:, 0] *= -1  # a jerk, as large as no servo's heat can surprise
+    tables[21]["position"][70, 1] = 5.0  # healthy, though no run that is learned from went so far
     return Episode.from_tables(tables, rate=10.0)
 
 
@@ -60,6 +61,7 @@ def test_a_number_that_cannot_be_is_an_alarm(memory, runs, column, number, tmp_p
 
 def test_what_healthy_runs_read_is_no_misreading(memory, runs):
     healthy = memory.readings_
+    assert np.isfinite(memory.threshold)
     for run in runs[:35]:
         assert without_misreadings(healthy, run.stream) is run.stream
 

@@ -347,10 +347,15 @@ class NeuralASM(CalibratedMonitor):
         return self._kernel
 
     def _balanced(self, episodes: Sequence[Episode], rate: AlarmRate) -> Self:
-        """Return a copy in which values and changes take half of the rate each, in nominal episodes."""
-        if self.values_ is None:
-            return self
+        """Return a copy in which values and changes take half of the rate each, in nominal episodes.
+
+        What was read in these is possible.
+        """
         other = self._copy()
+        if other.readings_ is not None:
+            other._widen_readings(episodes)
+        if self.values_ is None:
+            return other
         other.values_ = self.values_.of_changes_alone()
         by_changes = other.score_episodes(episodes)
         expected = rate.expected(episodes)
