@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
+from asm_gym.monitors import CalibratedMonitor
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import arm_recordings
@@ -133,6 +134,15 @@ def test_every_monitor_meets_the_same_faults(folder):
     )
     assert one == other
     assert set(one) == {*ADDED_FAULTS, ""}
+
+
+def test_a_quarter_without_a_threshold_is_left_out(folder, monkeypatch, caplog):
+    def refuse(monitor, episodes, **rates):
+        raise ValueError("the threshold came to 1e+09")
+
+    monkeypatch.setattr(CalibratedMonitor, "calibrate", refuse)
+    assert examined(Job("ur10", "kalman", 0, 3), folder) == []
+    assert "kalman on quarter 3 of ur10: the threshold came to 1e+09" in caplog.text
 
 
 def test_a_run_of_servos_is_cut_at_a_glitch_and_marked_rows_are_of_a_heated_servo(tmp_path):

@@ -9,6 +9,7 @@ one robot and few programs: no table says how a monitor fares on other motion.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +41,7 @@ from asm_gym.scripts.reproduce.arm_recordings import ARMS, REAL, RealArm
 from asm_gym.scripts.reproduce.kit import Findings, Record
 
 Floats = NDArray[np.float64]
+LOG = logging.getLogger("asm_gym.reproduce")
 
 RULE = "friction_rule"
 BODY = ", body"  # ends the name of a monitor that reads the arm's URDF
@@ -102,6 +104,10 @@ def run(config: Config) -> Findings:
     jobs = [job for job in map(Job._make, grid) if is_possible(job)]
     work = partial(examined, folder=config.folder)
     records = kit.records_of("watching", work, jobs, config)
+    recorded = {record["experiment"] for record in records}
+    if not recorded:
+        raise ValueError("no monitor has a threshold on any recording: see the warnings")
+    present = [name for name in present if name in recorded]
     tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
     left_out = "".join(f" Left out: {reason}." for reason in missing)
     others = [name for name in present if not ARMS[name].one_campaign]
@@ -167,14 +173,23 @@ def read_body(folder: Path, arm: RealArm) -> str:
 
 
 def examined(job: Job, folder: Path) -> list[Record]:
-    """Return a record for each tested piece as it is, for each fault in it, and for each labelled fault."""
+    """Return a record for each tested piece as it is, for each fault in it, and for each labelled fault.
+
+    There is none where the calibration set is too unlike what was learned from for any threshold; that is logged.
+    """
     arm = ARMS[job.experiment]
     runs, labelled = arm.episodes(folder)
     use = split(job, runs)
     urdf = read_body(folder, arm)
     monitor = fitted(job, use.learned, urdf)
     promised = 60.0 / minutes_of(use.calibration)  # the fewest that it can promise [1/h]
-    monitor.calibrate(use.calibration, false_alarms_per_hour=promised * (1 + 1e-9))
+    try:
+        monitor.calibrate(use.calibration, false_alarms_per_hour=promised * (1 + 1e-9))
+    except ValueError as error:
+        LOG.warning(
+            "left out: %s on quarter %d of %s: %s", job.monitor, job.fold, job.experiment, error
+        )
+        return []
     about = {**job._asdict(), "learned_min": minutes_of(use.learned), "promised": promised}
 
     scores = monitor.score_episodes(use.tested)
