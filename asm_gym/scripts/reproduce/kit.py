@@ -229,7 +229,14 @@ def grid(
     return table_of(caption, cells)
 
 
-def curves(ax: Axes, records: Records, value: str, x: str, lines: str) -> None:
+def curves(
+    ax: Axes,
+    records: Records,
+    value: str,
+    x: str,
+    lines: str,
+    order: Sequence[str] | None = None,
+) -> None:
     """Draw curves: means over seeds with a band of a SD.
 
     Args:
@@ -238,9 +245,14 @@ def curves(ax: Axes, records: Records, value: str, x: str, lines: str) -> None:
         value: name of the value on the vertical axis.
         x: name of the value on the horizontal axis.
         lines: name of the value that differs between curves.
+        order: its values, each of which looks the same in all axes; those of the records by default.
     """
     frame = pd.DataFrame(records)
-    for i, (label, own) in enumerate(frame.groupby(lines, sort=False)):
+    by_label = dict(list(frame.groupby(lines, sort=False)))
+    for i, label in enumerate(order or by_label):
+        if label not in by_label:
+            continue
+        own = by_label[label]
         means = own.groupby([x, "seed"])[value].mean().unstack("seed")
         mean = means.mean(axis=1)
         spread = means.std(axis=1)

@@ -216,12 +216,16 @@ def curves_figure(points: Sequence[Record]) -> Figure:
     """Draw reward, success and harm over steps, with a band of a SD, a row of panels for each task and algorithm."""
     frame = pd.DataFrame(points)
     motions = list(frame.groupby(["task", "algorithm"], sort=False))
+    ways = list(frame["way"].unique())
+    known: dict[str, Any] = {}
     with figure(height=0.5 + 2.3 * len(motions)) as fig:
         axes = fig.subplots(len(motions), 3, squeeze=False, sharex=True)
         for (left, middle, right), ((task, algorithm), own) in zip(axes, motions, strict=True):
-            kit.curves(left, own, "reward", "step", "way")
-            kit.curves(middle, own, "success", "step", "way")
-            kit.curves(right, own, "harm", "step", "way")
+            kit.curves(left, own, "reward", "step", "way", ways)
+            kit.curves(middle, own, "success", "step", "way", ways)
+            kit.curves(right, own, "harm", "step", "way", ways)
+            handles, labels = left.get_legend_handles_labels()
+            known |= dict(zip(labels, handles, strict=True))
             left.set(title=f"{task}, {algorithm}: reward", ylim=(0, None))
             middle.set(title="share solved", ylim=(0, 1))
             right.set(title="harm so far [N s]", yscale="log", ylim=(1, None))
@@ -230,6 +234,7 @@ def curves_figure(points: Sequence[Record]) -> Figure:
             ax.locator_params(axis="x", nbins=3)
         for ax in axes.ravel():
             ax.grid(axis="y")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=min(4, len(labels)))
+        fig.legend(
+            known.values(), known.keys(), loc="outside upper center", ncols=min(4, len(known))
+        )
     return fig
