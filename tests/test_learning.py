@@ -308,3 +308,28 @@ def test_every_run_of_the_study_has_a_file_of_its_own():
     names = {run.file_name for run in wanted}
     assert len(names) == len(wanted) == 5 * 4 * (6 + 4 + 4)
     assert [run.seed for run in wanted] == sorted(run.seed for run in wanted)
+
+
+def test_a_way_to_learn_looks_the_same_in_every_panel_and_the_legend_names_it_once():
+    runs = (("Door", "default"), ("Lift", "alone"), ("Lift", "default"))
+    points = [
+        {
+            "task": task,
+            "algorithm": "PPO",
+            "way": way,
+            "step": step,
+            "seed": 0,
+            "reward": 1.0,
+            "success": 0.0,
+            "harm": 2.0,
+        }
+        for task, way in runs
+        for step in (10, 20)
+    ]
+    fig = learning_tables.curves_figure(points)
+    (legend,) = fig.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["default", "alone"]
+    colours = {
+        line.get_color() for ax in fig.axes for line in ax.lines if line.get_label() == "default"
+    }
+    assert len(colours) == 1

@@ -2,8 +2,8 @@
 
 PPO and SAC of stable-baselines3 learn four motions alone, under guards, and with the cost of alarms in the reward.
 Harm is the contact force on the arm beyond 40 N, summed over all physics substeps of learning [N s], from the
-simulator. Every run has a file of its own: the same command continues after a kill. A run of PPO takes 1.5 minutes of
-one core and one of SAC three, the whole study some three and a half hours of two cores, by estimate.
+simulator. Every run has a file of its own: the same command continues after a kill. A run of PPO takes about
+1.5 minutes of one core and one of SAC six, the whole study some five hours of two cores, by estimate.
 """
 
 from __future__ import annotations
@@ -84,8 +84,7 @@ class PPOSettings(NamedTuple):
 
 
 class SACSettings(NamedTuple):
-    """Settings of SAC beside stable-baselines3's own: half an update for each step of a member, so that learning takes
-    no longer than the physics."""
+    """Settings of SAC beside stable-baselines3's own: half an update for each step of a member."""
 
     learning_starts: int = 1_000
     batch_size: int = 128

@@ -104,10 +104,7 @@ def run(config: Config) -> Findings:
     jobs = [job for job in map(Job._make, grid) if is_possible(job)]
     work = partial(examined, folder=config.folder)
     records = kit.records_of("watching", work, jobs, config)
-    recorded = {record["experiment"] for record in records}
-    if not recorded:
-        raise ValueError("no monitor has a threshold on any recording: see the warnings")
-    present = [name for name in present if name in recorded]
+    present = watched(records, present)
     tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
     left_out = "".join(f" Left out: {reason}." for reason in missing)
     others = [name for name in present if not ARMS[name].one_campaign]
@@ -160,6 +157,14 @@ def split(job: Job, runs: Sequence[Episode]) -> Split:
 def minutes_of(episodes: Sequence[Episode]) -> float:
     """Return the length of episodes [min]."""
     return sum(len(episode) * episode.spec.dt for episode in episodes) / 60
+
+
+def watched(records: Sequence[Record], present: Sequence[str]) -> list[str]:
+    """Return the recordings on which a monitor has a threshold."""
+    found = {record["experiment"] for record in records}
+    if not found:
+        raise ValueError("no monitor has a threshold on any recording: see the warnings")
+    return [name for name in present if name in found]
 
 
 def read_body(folder: Path, arm: RealArm) -> str:
