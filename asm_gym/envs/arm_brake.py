@@ -15,7 +15,8 @@ with the speed c, an impulse counts
 
 since a point that would not touch within T can still be braked. It counts in full also where it only grazes: MuJoCo's
 friction answers to all of its speed. Links but the hand never slide along things in healthy episodes, and theirs count
-in full within a millimetre of something. Beyond its share the motors slow the arm down,
+in full within a millimetre of something; friction pulls at them as they roll, so that they may have four fifths of a
+hand's impulse. Beyond its share the motors slow the arm down,
 
     τ ← τ - w (τ - h) - K (1 - s) M q̇       w ← max(5 (1 - s), 0.97 w), at most 1
 
@@ -61,7 +62,8 @@ DRIVEN_S = 0.01  # motors drive an arm on for so long while it is stopped [s]
 SURE_GAP = 2e-3  # curved surfaces may be nearer by so much than their nearest points were [m]
 LEAST_GAP = 1e-4  # no distance is divided by less [m]
 GRAZES = 1e-3  # a link but the hand that is so near to something may touch it [m]
-SLIDES = 0.005  # a point that comes nearer by less slides along [m/s]
+SLIDES = 0.005  # a point that comes nearer, or goes away, by less slides along [m/s]
+OF_LINKS = 0.8  # impulse that stops a link but the hand, of that of a hand where no healthy one was
 REACHES = 0.15  # from fingers to the far end of what they hold, and from links to joints [m]
 SLOWING = 200.0  # K: share of the speed beyond its limit that an arm loses in a second [1/s]
 ALL_DRIVE = 5.0  # an arm a fifth too fast is driven no further
@@ -79,7 +81,8 @@ class Approach(NamedTuple):
     """How near an arm is to touching something."""
 
     soon: float  # how soon a point does: 1 for within T, 0 for never
-    momentum: float  # p, the largest that counts [N s]
+    momentum: float  # p of the hand, the largest that counts [N s]
+    link_momentum: float  # the same of the other links [N s]
     leans: bool  # a link but the hand touches something already
 
 
@@ -136,29 +139,36 @@ def approach_of(views: Views, arm: Arm, a: int, ahead: Ahead, work: Work) -> App
     ``work.factor`` is the Cholesky factor of the arm's mass matrix.
     """
     soonest = 0.0
-    hardest = 0.0
+    of_hand = 0.0
+    of_links = 0.0
     leans = False
     n = 0
     while arm.links[n] >= 0:
+        hardest = 0.0
         if ahead.counts[a, n] == EVERYWHERE:
             soonest = 1.0
             place = place_of(views, arm, n)
-            hardest = max(hardest, point_momentum(views, arm, n, place, work))
+            hardest = point_momentum(views, arm, n, place, work)
         for k in range(ahead.counts[a, n]):
             point = ahead.points[a, n, k]
             gap = present_gap(views, arm.links[n], point, work.place)
             leans = leans or (n > 0 and gap <= 0.0)
             origin = views.subtree_com[arm.root]
             x, y, z = velocity_at(views.cvel[arm.links[n]], work.place, origin)
-            soon = how_soon(point.way, gap, x, y, z)
-            if n > 0 and gap < GRAZES and soon == 0.0:
+            closing = closing_speed(point.way, x, y, z)
+            soon = how_soon(closing, gap)
+            if n > 0 and gap < GRAZES and abs(closing) < SLIDES:
                 soon = 1.0
             if soon > 0.0:
                 momentum = point_momentum(views, arm, n, work.place, work)
                 soonest = max(soonest, soon)
                 hardest = max(hardest, soon * momentum)
+        if n == 0:
+            of_hand = hardest
+        else:
+            of_links = max(of_links, hardest)
         n += 1
-    return Approach(soon=soonest, momentum=hardest, leans=leans)
+    return Approach(soon=soonest, momentum=of_hand, link_momentum=of_links, leans=leans)
 
 
 @partial(inner, inlined=True)
@@ -174,14 +184,14 @@ def present_gap(views: Views, link: int, point: Any, place: Floats) -> float:
 
 
 @inner
-def how_soon(way: Floats, gap: float, x: float, y: float, z: float) -> float:
-    """Return how soon a point touches an obstacle that moves so fast [m/s]; see ``Approach``.
+def closing_speed(way: Floats, x: float, y: float, z: float) -> float:
+    """Return how fast a point that moves so fast comes nearer along a unit vector (3,) [m/s]."""
+    return way[0] * x + way[1] * y + way[2] * z
 
-    Args:
-        way: (3,) to the obstacle, a unit vector.
-        gap: how far it is [m].
-    """
-    closing = way[0] * x + way[1] * y + way[2] * z
+
+@inner
+def how_soon(closing: float, gap: float) -> float:
+    """Return how soon a point touches what is ``gap`` away [m] and comes nearer so fast [m/s]; see ``Approach``."""
     if closing < SLIDES:
         return 0.0
     return min(1.0, SOON_S * closing / max(gap - SURE_GAP, LEAST_GAP))
@@ -234,13 +244,13 @@ def share_at(
     views: Views, arm: Arm, a: int, limit: SpeedLimit, twist: Floats, approach: Approach
 ) -> float:
     """Return the share that arm ``a`` may have of a motion of its hand, a twist (6,), where the hand is now."""
-    momentum = approach.momentum
+    momentum = max(approach.momentum, approach.link_momentum)
     share = usual_share(limit, twist_speed(twist), approach.soon, momentum)
     upright = -views.site_xmat[arm.site, 8]  # 1 for a hand that points down
     if limit.grid.size > 0 and upright >= limit.least_upright:
         place = views.site_xpos[arm.site]
-        share = paced_share(limit, a, place, twist, share, momentum)
-    return share
+        share = paced_share(limit, a, place, twist, share, approach.momentum)
+    return min(share, OF_LINKS * limit.momentum / max(approach.link_momentum, LEAST_SPEED))
 
 
 @partial(inner, inlined=True)
@@ -282,7 +292,7 @@ def slow_down(
     if is_beside_base(views, arm):
         limit = limits.motion[1]
     write_twist(arm, work)
-    approach = Approach(soon=1.0, momentum=0.0, leans=False)
+    approach = Approach(soon=1.0, momentum=0.0, link_momentum=0.0, leans=False)
     if limit.momentum < np.inf:
         cholesky(work.mass, arm.joint_count, work.factor)
         write_gained(views, arm, goal, work)
