@@ -129,6 +129,8 @@ FOREARM_WHERE_HANDS_WENT = FOREARM_ROLLS._replace(
     ],
 )
 def test_links_that_roll_on_a_table_or_graze_it_meet_it_gently(task, program):
-    """The first and last were beyond 430 N where nearest points were found once a step, or grazing points did not count;
-    the second was 317 N where a link had the limit of a hand."""
+    """They were beyond 430 N where nearest points were found once a step, or grazing points did not count;
+
+    the second was 317 N where a link had the limit of a hand.
+    """
     assert tried(Search(task, "Panda", "default", 0, 1), program)["force"] < 280.0
