@@ -56,6 +56,7 @@ class Views(NamedTuple):
     subtree_com: Floats  # (nbody, 3)
     xpos: Floats  # (nbody, 3)
     xmat: Floats  # (nbody, 9)
+    geom_xpos: Floats  # (ngeom, 3)
     site_xpos: Floats  # (nsite, 3)
     site_xmat: Floats  # (nsite, 9)
     sensordata: Floats
