@@ -7,7 +7,10 @@ import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
+from asm_gym.detection import ModelOutput
 from asm_gym.monitors import CalibratedMonitor
+from asm_gym.monitors.stream_model import StreamModel, no_context
+from asm_gym.monitors.torque.arm_features import position_columns, torque_columns
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import arm_recordings
@@ -27,6 +30,7 @@ from asm_gym.scripts.reproduce.real_arms import (
     noise_table,
     split,
 )
+from asm_gym.scripts.reproduce.torque_residuals import RESIDUAL, residual_table, residuals
 from tests.streams import pendulum_columns
 
 INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
@@ -134,6 +138,44 @@ def test_every_monitor_meets_the_same_faults(folder):
     )
     assert one == other
     assert set(one) == {*ADDED_FAULTS, ""}
+
+
+class TorqueByAngle(StreamModel):
+    """Says that the torque of each joint is three times its angle, and averages over four rows."""
+
+    kind = "torque_by_angle"
+    window = 4
+
+    @property
+    def error_columns(self):
+        return torque_columns(self.spec)
+
+    def start(self, batch):
+        return np.zeros((batch, self.window, 2))
+
+    def predict(self, state, rows):
+        angles = rows[:, position_columns(self.spec)]
+        rest = (rows[:, self.error_columns] - 3.0 * angles) / np.array([0.2, 5.0])
+        state = np.concatenate([state[:, 1:], rest[:, None]], axis=1)
+        return state, ModelOutput(state.mean(axis=1), no_context(rows))
+
+
+def test_a_residual_is_what_a_prediction_leaves_of_a_torque_in_its_own_unit():
+    episode = Episode.from_table(pendulum_columns(200))
+    torques = torque_columns(episode.spec)
+    stream = episode.stream.astype(np.float64)
+    rest = stream[:, torques] - 3.0 * stream[:, position_columns(episode.spec)]
+    expected = pd.DataFrame(rest).rolling(4).mean()
+    found = residuals(TorqueByAngle(episode.spec), episode, torques, np.ones(2))
+    np.testing.assert_allclose(found, expected.iloc[-len(found) :], rtol=1e-6)
+    assert 0 < len(found) < 200
+
+
+def test_residuals_are_printed_for_arms_with_torques(folder):
+    records = examined(Job("ur10", "friction_rule", 0, 0), folder)
+    own = [record for record in records if record["kind"] == RESIDUAL]
+    assert [record["joint"] for record in own] == ["1", "2"]
+    assert residual_table(pd.DataFrame(records)).rows[0][0] == "friction_rule"
 
 
 def test_a_quarter_without_a_threshold_is_left_out(folder, monkeypatch, caplog):

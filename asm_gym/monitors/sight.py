@@ -2,7 +2,8 @@
 
     x'_t = x_t + a R      for a second from an onset on;   R: range of the sense, a: a share of it
 
-An error is seen where it raises an alarm within that second, and nothing did before.
+An error is seen where it raises an alarm within that second; where an alarm came before it, nothing is known. A size
+counts where k of P places show it and (k + 1)/(P + 2) >= 0.8 (Laplace's rule of succession): of five places, all.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from asm_gym.monitors.torque.arm_features import position_columns, torque_column
 SHARES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # a, of a range
 RANGE = (0.05, 0.95)  # quantiles between which a sense ranges
 PLACES = 5  # episodes in which errors are tried, in both directions
-MOST = 0.8  # share of the places in which an error is seen
+MOST = 0.8  # share of other places in which an error is expected to be seen
 BEFORE_S = 3.0  # of a clip before the error [s]
 LASTS_S = 1.0  # length of an error [s]
 
@@ -100,39 +101,61 @@ def sights(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> list[Sigh
     errors = Errors.of(episodes, SHARES)
     if not errors.clips:
         return []
-    seen = _is_seen(monitor, errors).mean(axis=2)
+    seen = _is_seen(monitor, errors)
+    is_enough = expected_share(np.nan_to_num(seen)) >= MOST
     spec = monitor.spec
     return [
         _least(spec.labels[column], spec.units[column], of_column, own_sizes)
-        for column, of_column, own_sizes in zip(errors.columns, seen, errors.sizes, strict=True)
+        for column, of_column, own_sizes in zip(
+            errors.columns, is_enough, errors.sizes, strict=True
+        )
     ]
+
+
+def expected_share(seen: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the share of other places in which errors (…, P) would be seen, by both directions at each place."""
+    places = seen.shape[-1] / 2
+    shown = seen.sum(axis=-1) / 2
+    return np.asarray((shown + 1) / (places + 2))
 
 
 def seen_again(
     monitor: CalibratedMonitor, sizes: Sequence[Sight], episodes: Sequence[Episode]
 ) -> NDArray[np.bool_]:
-    """Return which errors (C, P), of the sizes that a monitor says it sees, it sees in other episodes."""
+    """Return which errors (N,), of the sizes that a monitor says it sees, it sees in other episodes.
+
+    Those that an alarm came before are left out.
+    """
     finite = [sight for sight in sizes if math.isfinite(sight.size)]
     if not finite:
-        return np.zeros((0, 2 * PLACES), bool)
+        return np.zeros(0, bool)
     columns = [monitor.spec.labels.index(sight.label) for sight in finite]
     each_size = np.array([[sight.size] for sight in finite])
     errors = Errors.at(episodes, np.array(columns, np.intp), each_size)
-    return _is_seen(monitor, errors)[:, 0]
+    seen = _is_seen(monitor, errors)
+    return seen[np.isfinite(seen)] > 0
 
 
-def _is_seen(monitor: CalibratedMonitor, errors: Errors) -> NDArray[np.bool_]:
-    """Return which errors raise an alarm (C, A, P)."""
-    is_seen = []
+def _is_seen(monitor: CalibratedMonitor, errors: Errors) -> NDArray[np.float64]:
+    """Return 1 for errors that raise an alarm, else 0 (C, A, P); NaN where an alarm came before."""
+    seen = []
     for score, onset in zip(monitor.score_episodes(errors.clips), errors.onsets, strict=True):
-        is_seen.append(first_alarm(score, monitor.threshold, onset) is not None)
-    return np.reshape(is_seen, (*errors.sizes.shape, -1))
+        is_over = score.value > monitor.threshold
+        if is_over[:onset].any():
+            seen.append(math.nan)
+        else:
+            seen.append(float(is_over[onset:].any()))
+    return np.reshape(seen, (*errors.sizes.shape, -1))
 
 
-def _least(label: str, unit: str, seen: NDArray[np.float64], sizes: NDArray[np.float64]) -> Sight:
-    """Return the least of sizes (A,) that is seen in most places, by the share of places (A,)."""
-    is_enough = np.flatnonzero(seen >= MOST)
-    if not len(is_enough):
+def _least(
+    label: str, unit: str, is_enough: NDArray[np.bool_], sizes: NDArray[np.float64]
+) -> Sight:
+    """Return the least of sizes (A,) from which on all are seen in enough places (A,)."""
+    is_too_small = np.flatnonzero(~is_enough)
+    first = 0
+    if len(is_too_small):
+        first = int(is_too_small[-1]) + 1
+    if first == len(sizes):
         return Sight(label, unit, size=math.inf, share=math.inf)
-    first = is_enough[0]
     return Sight(label, unit, size=float(sizes[first]), share=SHARES[first])

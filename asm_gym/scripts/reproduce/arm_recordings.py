@@ -214,17 +214,6 @@ def synthetic_runs(_: Path) -> Runs:
 
 
 SECONDS = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-HIRO = RealArm(
-    robot="Kawada HIRO",
-    place="hiro_snap_assembly",
-    source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
-    read=hiro_runs,
-    piece_s=np.inf,
-    rate=50.0,
-    efforts=("force", "torque"),
-    has_joint_torques=False,
-    one_campaign=False,
-)
 ARMS = {
     "panda": RealArm(
         robot="Franka Panda",
@@ -259,8 +248,17 @@ ARMS = {
         rate=125.0,
         urdf="ur3_robot.urdf",
     ),
-    "hiro": HIRO,
-    "hiro_repeated": replace(HIRO, robot="Kawada HIRO, one programme", read=hiro_repetitions),
+    "hiro": RealArm(
+        robot="Kawada HIRO",
+        place="hiro_snap_assembly",
+        source="HongminWu/HIRO_SA_DATA @ 5773e085 (ODbL 1.0)",
+        read=hiro_runs,
+        piece_s=np.inf,
+        rate=50.0,
+        efforts=("force", "torque"),
+        has_joint_torques=False,
+        one_campaign=False,
+    ),
     "armpi": RealArm(
         robot="ArmPi FPV",
         place="armpi_fpv_faults",
@@ -281,5 +279,8 @@ ARMS = {
         rate=25.0,
     ),
 }
-"""Sets by name; the first three are of seconds, the others of minutes, and the last one is simulated."""
+"""Sets by name; the first three are of seconds, the others of minutes, and ``synthetic`` is simulated."""
+ARMS["hiro_repeated"] = replace(
+    ARMS["hiro"], robot="Kawada HIRO, one programme", read=hiro_repetitions
+)
 REAL = tuple(name for name in ARMS if ARMS[name].place)
