@@ -18,7 +18,8 @@ from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.torque.arm_features import judged_by_values, motion_columns, torque_columns
-from asm_gym.monitors.torque.value_association import ValueAssociation, running_mean
+from asm_gym.monitors.torque.speed_precision import running_mean, speed_weights, usual_errors
+from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.monitors.torque.value_judge import ValueJudge
 from asm_gym.scripts.cli import main
 from asm_gym.spec import Channel
@@ -72,6 +73,46 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
     most = [np.abs(o.errors).max(axis=0) for o in model_outputs(model, cut[:20])]
     # The largest cross-fitted error is about that of rows that it has learned from.
     assert (np.max(most, axis=0) < 1.1).all()
+
+
+def test_errors_count_for_less_at_speeds_at_which_they_are_usually_larger():
+    rng = np.random.default_rng(0)
+    squares = rng.uniform(size=(4000, 2, 3))
+    squares[:, 1] = 0.0  # of a value that no joint's speed belongs to
+    spread = np.exp(1.2 * (squares[:, 0, 1] - 0.5))
+    errors = rng.normal(size=(4000, 2))
+    errors[:, 0] *= spread
+    usual = usual_errors(speed_weights(errors, squares), squares)
+    assert np.corrcoef(np.log(usual[:, 0]), np.log(spread))[0, 1] > 0.99
+    assert 0.7 < np.log(usual[:, 0]).std() / np.log(spread).std() <= 1.0
+    assert abs(np.log(usual[:, 0]).mean()) < 1e-9
+    np.testing.assert_array_equal(usual[:, 1], 1.0)
+
+
+def test_a_torque_is_judged_by_how_far_its_errors_go_at_the_speed_of_its_joint(tmp_path):
+    columns = pendulum_columns(6000)
+    speed = columns["velocity"][:, 0]
+    is_slow = np.abs(speed) < 0.1 * speed.std()
+    noise = np.random.default_rng(1).normal(size=6000)
+    columns["effort"] = columns["effort"].copy()
+    columns["effort"][:, 0] += np.where(is_slow, 1.0, 0.1) * noise
+    cut = pieces(Episode.from_table(columns), 1.0)
+    model = ValueAssociation(cut[0].spec).fit(
+        cut[:50], np.random.default_rng(0), lambda done, total: None
+    )
+    model.window = 1
+    ratio = []
+    for by_speed in (model.learned_["by_speed"], None):
+        learned = {**model.learned_, "by_speed": by_speed}
+        if by_speed is None:  # as a file of an earlier version is
+            del learned["by_speed"]
+        model.restore(learned)
+        errors = np.concatenate(
+            [output.errors[10:, 0] for output in model_outputs(model, cut[50:])]
+        )
+        slow = np.concatenate([part[10:] for part in np.split(is_slow[5000:6000], 10)])
+        ratio.append(np.std(errors[slow]) / np.std(errors[~slow]))
+    assert ratio[0] < 0.5 * ratio[1]
 
 
 TWO_NUMBERS = Episode.from_table({"q": np.zeros((9, 2))}, rate=10.0).spec

@@ -131,6 +131,12 @@ def read_next(
     return history.followed_by(rows), reading, known
 
 
+def rows_after(lag: int, readings: Sequence[ScaledRows]) -> ScaledRows:
+    """Return the rows of episodes without the first ``lag`` of each, before which nothing is known."""
+    trimmed = [[array[lag:] for array in reading] for reading in readings]
+    return ScaledRows._make(map(np.concatenate, zip(*trimmed, strict=True)))
+
+
 class Stretch(NamedTuple):
     """Consecutive rows of one stream, after some that came before them."""
 

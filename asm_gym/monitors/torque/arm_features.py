@@ -117,13 +117,17 @@ class ArmFeatures:
         """The sines and cosines of single angles that are multiplied (P,), (P,)."""
         return np.triu_indices(2 * len(self.angles))
 
-    def __call__(self, rows: PhysicalRows) -> Floats:
-        """Return the features (N, M) of rows."""
+    def friction(self, rows: PhysicalRows) -> list[Floats]:
+        """Return smooth signs (N, S) of the speeds in rows, for each of ``WIDTHS``."""
         if self.from_changes:
             speed = rows.changes[:, self.speeds]
         else:
             speed = rows.values[:, self.speeds] / rows.spread[self.speeds]
-        parts = [np.tanh(speed / width) for width in WIDTHS]
+        return [np.tanh(speed / width) for width in WIDTHS]
+
+    def __call__(self, rows: PhysicalRows) -> Floats:
+        """Return the features (N, M) of rows."""
+        parts = self.friction(rows)
         if self.body is not None:
             parts += self.body.torques(self.motion(rows))
         if len(self.angles):

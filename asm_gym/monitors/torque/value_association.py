@@ -2,10 +2,11 @@ r"""Ridge regression of values: each group of senses from the values and changes
 
     x̂_g,t = D_g [x_{¬g,t}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]       judged: torques, and what a cross-fitted R² of 1/2 tells
     φ      friction and weight, see ``arm_features``
-    r_t    = (x_t - x̂_t) / √max(1, h/h̃)
+    r_t    = (x_t - x̂_t) / σ_t √max(1, h/h̃)
     ε_t    = (r_t + … + r_{t-w+1}) / w q                      w: rows of a tenth of a second
     q      the largest |r_t + … + r_{t-w+1}| / w of each x in nominal episodes, cross-fitted
     h, h̃   leverage and its cross-fitted median, see ``crossfitting``
+    σ      of a torque, by the speed of its joint, see ``speed_precision``; 1 of other values
 
 A push that is held is explained after one step where a value is predicted from its own last one; where it is predicted
 from the others, it is not. A torque is always judged; positions and speeds, beside torques, are left to their changes,
@@ -29,7 +30,13 @@ from asm_gym.detection.base import Arrays
 from asm_gym.memory.linear_association import check_inputs
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.monitor_protocol import Progress
-from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next, require_arrays
+from asm_gym.monitors.stream_model import (
+    ScaledModel,
+    no_context,
+    read_next,
+    require_arrays,
+    rows_after,
+)
 from asm_gym.monitors.torque.arm_features import (
     WIDTHS,
     ArmFeatures,
@@ -45,6 +52,12 @@ from asm_gym.monitors.torque.crossfitting import (
     Leverage,
     folds_of,
     quadratic_form,
+)
+from asm_gym.monitors.torque.speed_precision import (
+    episode_means,
+    running_mean,
+    speed_weights,
+    usual_errors,
 )
 from asm_gym.scaling import ScaledRows, rows_apart
 from asm_gym.spec import StreamSpec
@@ -156,6 +169,10 @@ class ValueAssociation(ScaledModel):
         columns: Places = np.zeros(0, np.intp)
         if fit.features.body is not None:
             columns = fit.features.body.columns
+        squares = self._friction_squares(rows, judged)
+        by_speed = speed_weights(episode_means(errors, lengths, self.window), squares)
+        errors /= usual_errors(by_speed, squares)
+        largest = np.abs(episode_means(errors, lengths, self.window)).max(axis=0)
         progress(1, 1)
         learned = {
             "derived_mean": fit.mean,
@@ -163,25 +180,18 @@ class ValueAssociation(ScaledModel):
             "body": columns.astype(np.float64),
             "judged_values": judged.astype(np.float64),
             "R2_values": regression.R2,
+            "by_speed": by_speed,
             "D": regression.weights[judged],
-            "largest": self._largest_mean(errors, lengths),
+            "largest": np.maximum(largest, LEAST_REMAINDER),
             "far": matrices,
             "far_of": matrix_of.astype(np.float64),
         }
         return self.restore({**self.senses_.arrays, **learned})
 
-    def _largest_mean(self, errors: Floats, lengths: Sequence[int]) -> Floats:
-        """Return q (V,) of the errors (N, V) of episodes that are so long."""
-        episode_ends = np.cumsum(lengths)[:-1]
-        largest = np.full(errors.shape[1], LEAST_REMAINDER)
-        for episode in np.split(errors, episode_ends):
-            means = np.abs(running_mean(episode, self.window))
-            largest = np.maximum(largest, means.max(axis=0))
-        return largest
-
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         require_arrays(learned, LEARNED)
         self._judged = learned["judged_values"].astype(np.intp)
+        self._by_speed = learned.get("by_speed")
         self._features = self._by_sines
         columns = learned["body"].astype(np.intp)
         body = self._by_body.body
@@ -222,7 +232,20 @@ class ValueAssociation(ScaledModel):
 
         expected = inputs @ learned["D"].T
         rest = scaled.values[:, self._judged] - expected
-        return np.asarray(known * rest / self._widening(inputs))
+        usual = self._widening(inputs)
+        if self._by_speed is not None:
+            usual *= usual_errors(self._by_speed, self._friction_squares(scaled, self._judged))
+        return np.asarray(known * rest / usual)
+
+    def _friction_squares(self, rows: RegressionRows, judged: Places) -> Floats:
+        """Return squares of friction (N, V, W) of the joints of judged torques; 0 of other values."""
+        squares = np.zeros((len(rows.values), len(judged), len(WIDTHS)))
+        if len(self._torques) != len(self._by_sines.speeds):
+            return squares
+        _, places, joints = np.intersect1d(judged, self._torques, return_indices=True)
+        signs = self._by_sines.friction(self._physical(rows))
+        squares[:, places] = np.stack(signs, axis=2)[:, joints] ** 2
+        return squares
 
     def judged(self, R2: Floats) -> Places:
         """Return which values are judged, by their cross-fitted R² (X,)."""
@@ -383,19 +406,6 @@ class ValueAssociation(ScaledModel):
         return np.sqrt(np.maximum(1.0, leverage))
 
 
-def rows_after(lag: int, readings: Sequence[ScaledRows]) -> ScaledRows:
-    """Return the rows of episodes without the first ``lag`` of each, before which nothing is known."""
-    trimmed = [[array[lag:] for array in reading] for reading in readings]
-    return ScaledRows._make(map(np.concatenate, zip(*trimmed, strict=True)))
-
-
 def inputs_of(rows: RegressionRows, features: Floats) -> Floats:
     """Return the inputs (N, I) of regression for rows with standardised features (N, M)."""
     return np.hstack([rows.values, rows.changes, rows.before, features, rows.commands])
-
-
-def running_mean(errors: Floats, window: int) -> Floats:
-    """Return the mean (T, V) of the last ``window`` rows of errors (T, V); before the first they are 0."""
-    before = np.zeros((window, errors.shape[1]))
-    total = np.cumsum(np.vstack([before, errors]), axis=0)
-    return (total[window:] - total[:-window]) / window

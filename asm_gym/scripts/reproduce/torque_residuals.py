@@ -1,12 +1,14 @@
 """How far a model's prediction of each joint's torque is from the measured one.
 
-    r_t = ε_t δ / (ε_t(x_t + δ) - ε_t) / w      ε: error of the torque x_t, linear in it;  w: rows that it averages
+    r_t = ε_t δ / (ε_t(x_t + δ) - ε_t)      ε: error of the torque x_t, linear in it, by a model that averages nothing
 
+What a model averages over, the tenth of a second for one, residuals are averaged over here.
 A model that predicts a torque from its own past has a small residual, and takes over a fault that lasts with that past.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -57,6 +59,9 @@ def residuals(
 ) -> Floats:
     """Return the residuals (T', J) of torques (J,) of an episode in their units; NaN where none is predicted."""
     errors_of = np.searchsorted(model.error_columns, torques)
+    window = getattr(model, "window", 1)
+    model = copy.copy(model)
+    vars(model)["window"] = 1
     joint = np.arange(len(torques))
     nudge = NUDGE * ranges
     state = model.start(len(torques))
@@ -72,7 +77,8 @@ def residuals(
         unknown = np.full_like(errors, np.nan)
         found.append(np.divide(errors, slope, out=unknown, where=slope != 0))
     first = round(SETTLED_S / episode.spec.dt)
-    return np.array(found)[first:] / getattr(model, "window", 1)
+    means: Floats = pd.DataFrame(found).rolling(window).mean().to_numpy()
+    return means[first:]
 
 
 def residual_table(records: pd.DataFrame) -> Table:
