@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.data.episode import EpisodeLabel, load_episode
@@ -38,12 +37,9 @@ def run(tmp_path_factory):
     return folder
 
 
-def test_it_writes_a_table_a_row_for_each_episode_and_a_report(run):
-    rows = pq.read_table(run / "results.parquet").to_pylist()
-    assert len(rows) == len(MONITORS) * (4 + 3 * 2 * 2)
-    push = [r for r in rows if r["kind"] == "push" and r["severity"] == "strong"]
-    assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
-    assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
+def test_it_writes_tables_and_a_report(run):
+    tables = (run / "results.md").read_text()
+    assert all(name in tables for name in MONITORS)
     report = (run / "report.html").read_text()
     assert "ideal observer" in report
     assert f"asm-gym {__version__}" in report

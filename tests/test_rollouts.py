@@ -207,7 +207,7 @@ def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
 def test_in_a_pipe_progress_is_a_line_now_and_then_and_in_a_terminal_a_bar(monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
     out, seconds = io.StringIO(), {}
-    with progress.stage("recording [all]", Console(file=out), seconds) as tell:
+    with progress.stage("recording [all]", seconds, Console(file=out)) as tell:
         tell(3, 12)
         tell(12, 12)
     assert out.getvalue().splitlines() == [
@@ -217,6 +217,8 @@ def test_in_a_pipe_progress_is_a_line_now_and_then_and_in_a_terminal_a_bar(monke
     ]
     assert set(seconds) == {"recording [all]"}
     out = io.StringIO()
-    with progress.stage("recording", Console(file=out, force_terminal=True, width=80)) as tell:
+    with progress.stage(
+        "recording", console=Console(file=out, force_terminal=True, width=80)
+    ) as tell:
         tell(3, 12)
     assert "12/12" in out.getvalue()

@@ -81,7 +81,7 @@ class RecurrentWeights(NamedTuple):
     B_im: Array
     W_C: Array  # (H, I) from what is carried on to the state
     W_F: Array  # (S + A, H) from the state to senses and action
-    W_D: Array  # (S + A, I + A + 1) from what is carried on, action and a constant 1 to senses and action
+    W_D: Array  # (S + A, I + A + 1) from what is carried on, action and 1 to senses and action
 
 
 def recurrent_units(hidden: int) -> int:

@@ -182,7 +182,6 @@ def evaluate(args: Args, console: Console) -> None:
     """Record, fit, judge and publish; print the tables in brief."""
     args = without_unfit_monitors(args, console)
     seconds: dict[str, float] = {}  # of each stage
-    timed = partial(stage, console=console, seconds=seconds)
     claim = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     trials = []
     if args.corpus is not None:
@@ -193,9 +192,9 @@ def evaluate(args: Args, console: Console) -> None:
         files = [args.out / trial.label.path for trial in trials]
     with claimed(args.out, "recordings.json", claim):
         if trials:
-            with timed("recording") as progress:
+            with stage("recording", seconds) as progress:
                 record_missing(trials, args.config, args.out, args.workers, progress)
-        with timed("fitting and judging") as progress:
+        with stage("fitting and judging", seconds) as progress:
             result = benchmark(
                 args.out,
                 files,
@@ -205,7 +204,7 @@ def evaluate(args: Args, console: Console) -> None:
                 seed=args.seed,
                 map_items=partial(parallel_map, workers=args.workers, progress=progress),
             )
-        with timed("drawing"):
+        with stage("drawing", seconds):
             details = origin() | json.loads(json.dumps(asdict(args), default=str))
             machine = {"python": platform.python_version(), "machine": platform.machine()}
             publish(args.out, result, details | machine | {"seconds": seconds})
@@ -214,7 +213,7 @@ def evaluate(args: Args, console: Console) -> None:
         tables.append(kinds_table(result))
     for table in tables:
         console.print(table)
-    console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
+    console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.md'}")
 
 
 main = partial(run, "evaluate", Args, evaluate)
