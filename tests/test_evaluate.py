@@ -10,7 +10,7 @@ from asm_gym.scripts import command
 from asm_gym.scripts.evaluate import Args, main, trials_of
 from asm_gym.version import __version__
 
-MONITORS = ("neural_asm", "kalman+evidence", "association_linear", "force_limit")
+MONITORS = ("neural_asm", "kalman+evidence", "association_linear")
 SMALL = [
     *(
         "--tasks",
@@ -81,7 +81,7 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--faults flood", "'flood'.*push"),
         ("--tasks Juggle", "'Juggle'.*Lift"),
         ("--monitors oracle", "'oracle'.*neural_asm"),
-        ("--monitors force_limit+magic", "'magic'.*evidence"),
+        ("--monitors kalman+magic", "'magic'.*evidence"),
         ("--severities deadly", "'deadly'.*mild"),
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
         ("--faulty-episodes 5", "at most 4, got 5"),

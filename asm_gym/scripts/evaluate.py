@@ -43,8 +43,6 @@ _QUICK = (
     "association_linear+evidence",
     "kalman+evidence",
     "logpzo",
-    "external_torque_limit",
-    "force_limit",
 )
 """Monitors that are fitted in seconds."""
 
@@ -69,7 +67,7 @@ class Args(Options):
         ("neural_asm", *BY_EVIDENCE), quick=_QUICK, least=1, check=check_monitor_name
     )
     """Names of monitors. Without +evidence a rival is judged as its authors do; MODEL+DETECTION combines any two, as in
-    external_torque_limit+evidence."""
+    kalman+squares."""
     faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all; development or test for one half of the suite."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
