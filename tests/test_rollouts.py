@@ -204,6 +204,14 @@ def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
 # ------------------------------------------------------------------ progress
 
 
+def test_progress_goes_to_standard_error_so_that_results_can_be_piped(capsys):
+    with progress.stage("recording") as tell:
+        tell(12, 12)
+    shown = capsys.readouterr()
+    assert not shown.out
+    assert "recording: 12 of 12, done in" in shown.err
+
+
 def test_in_a_pipe_progress_is_a_line_now_and_then_and_in_a_terminal_a_bar(monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
     out, seconds = io.StringIO(), {}

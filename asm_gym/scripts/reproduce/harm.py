@@ -94,9 +94,7 @@ class Config(kit.Config):
     """
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
-    guards: tuple[str, ...] = option(
-        (POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME"
-    )
+    guards: tuple[str, ...] = option((POLICY_ALONE, "default"), known=GUARDS, metavar="NAME")
     """Ways to guard."""
     tasks: tuple[str, ...] = option(ALL_TASKS, quick=("Lift",), known=ALL_TASKS, metavar="TASK")
     """Tasks; hostile policies act in the first five, and in the last two where these are against unmet ones."""
