@@ -1,4 +1,4 @@
-"""``asm-gym reproduce <study>``: the claims of the method, each as one study with a figure, tables and every number."""
+"""``asm-gym reproduce <study>``: the claims of the method, each as one study with tables and every number."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from asm_gym.evaluation.figures import look, save
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown
-from asm_gym.files import write_text, written_whole
+from asm_gym.files import write_text
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage as stage  # for studies
 from asm_gym.rollouts.run_folder import versions
@@ -100,9 +100,7 @@ def write(path: Path, findings: Findings, config: Any, seconds: float) -> list[s
     suffixes = []
     if findings.figure is not None:
         save(findings.figure, path.with_suffix(".png"))
-        with written_whole(path.with_suffix(".svg")) as file:
-            findings.figure.savefig(file, format="svg", metadata={"Date": None})
-        suffixes = [".png", ".svg"]
+        suffixes = [".png"]
     details = {
         "arguments": asdict(config),
         "seed": config.seed,
