@@ -42,7 +42,108 @@ def written(path: Path, lines: list[str], end: str = "\n") -> Path:
     return path
 
 
+# ------------------------------------------------------------------ TwinCAT Scope
+
+SCOPE_FIELDS = {
+    "SymbolComment": "",
+    "Data-Type": "REAL64",
+    "SampleTime[ms]": "1",
+    "VariableSize": "8",
+    "SymbolBased": "True",
+    "Offset": "0",
+    "ScaleFactor": "1",
+}
+
+
+def scope(
+    path: Path,
+    times: list[np.ndarray],
+    values: list[np.ndarray],
+    units: list[str],
+    mark: str = ".",
+) -> Path:
+    """Write channels, each with its own times [ms], as TwinCAT Scope does; a shorter one has empty cells below."""
+
+    def line(key: str, cells: list[str]) -> str:
+        return "\t".join(f"{key}\t{cell}" for cell in cells)
+
+    names = NAMES[: len(times)]
+    lines = ["Name\tscope", "File\tscope.csv", "", "", line("Name", names)]
+    lines += [line(key, [cell] * len(names)) for key, cell in SCOPE_FIELDS.items()]
+    lines += [line("Unit", units), ""]
+    for row in range(max(map(len, times))):
+        cells = []
+        for own, channel in zip(times, values, strict=True):
+            cells += [f"{own[row]:g}", f"{channel[row]:.5f}"] if row < len(own) else ["", ""]
+        lines.append("\t".join(cells).replace(".", mark))
+    return written(path, lines)
+
+
+@pytest.mark.parametrize("mark", [",", "."])
+def test_a_scope_export_is_read_by_its_channels(mark, tmp_path):
+    t, values = motion(0.001)
+    path = scope(tmp_path / "x.csv", [1000 * t] * 4, list(values.T), ["(None)"] * 4, mark)
+    table = read_text(path)
+    assert list(table) == ["time [ms]", *NAMES]
+    np.testing.assert_array_equal(table["time [ms]"], np.arange(ROWS))
+    for name, column in zip(NAMES, values.T, strict=True):
+        np.testing.assert_allclose(table[name], column, atol=1e-5)
+    episode = read(path)
+    assert episode.spec.dt == pytest.approx(0.001)
+    assert episode.stream.shape == (ROWS, 4)
+
+
+def test_units_of_a_scope_export_stand_behind_its_channels(tmp_path):
+    t, values = motion(0.001)
+    units = ["(rad)", "rad", "(None)", ""]
+    table = read_text(scope(tmp_path / "x.csv", [1000 * t] * 4, list(values.T), units))
+    assert list(table) == ["time [ms]", "q1 [rad]", "q2 [rad]", "M1", "M2"]
+
+
+def test_slower_channels_of_a_scope_export_keep_their_newest_value(tmp_path):
+    fast = np.arange(20.0)
+    slow = np.arange(1.0, 20.0, 3.0)
+    path = scope(tmp_path / "x.csv", [fast, slow], [fast**2, slow**2], ["(None)"] * 2)
+    table = read_text(path)
+    assert list(table) == ["time [ms]", "q1", "q2"]
+    np.testing.assert_array_equal(table["q1"], fast**2)
+    newest = [max(slow[slow <= time], default=np.nan) ** 2 for time in fast]
+    np.testing.assert_array_equal(table["q2"], newest)
+
+
+def test_the_first_channel_of_a_scope_export_sets_the_rows(tmp_path):
+    fast = np.arange(20.0)
+    slow = np.arange(0.0, 20.0, 5.0)
+    path = scope(tmp_path / "x.csv", [slow, fast], [slow, fast**2], ["(None)"] * 2)
+    table = read_text(path)
+    np.testing.assert_array_equal(table["time [ms]"], slow)
+    np.testing.assert_array_equal(table["q2"], slow**2)
+
+
 # ------------------------------------------------------------------ refused
+
+DIADEM_HEADER = [
+    "DIAEXTENDED  {@:ENGLISH",
+    "#BEGINGLOBALHEADER",
+    "101,KRC",
+    "106,9.9E+34",
+    "#ENDGLOBALHEADER",
+    "",
+    "#BEGINCHANNELHEADER",
+    "200,Istposition_Achse1",
+    "210,EXPLICIT",
+    "211,TRACE.r64",
+    "220,400",
+    "#ENDCHANNELHEADER",
+]
+
+
+@pytest.mark.parametrize("hints", [{}, {"columns": ["number", "value"]}, {"rate": 100.0}])
+def test_the_header_of_a_binary_log_is_refused_and_names_the_log(hints, tmp_path):
+    path = written(tmp_path / "trace.dat", DIADEM_HEADER, end="\r\n")
+    with pytest.raises(ValueError, match=r"TRACE\.r64.*CSV") as refused:
+        read(path, **hints)
+    assert "--columns" not in str(refused.value)
 
 
 def with_commas(values: np.ndarray, digits: int) -> list[str]:
