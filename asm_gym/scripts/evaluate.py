@@ -8,10 +8,12 @@ from __future__ import annotations
 import json
 import math
 import platform
-from dataclasses import asdict, dataclass
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
@@ -21,6 +23,7 @@ from asm_gym.evaluation.report_page import publish
 from asm_gym.evaluation.scoring import benchmark
 from asm_gym.faults import foreign_faults
 from asm_gym.faults.suite import SEVERITIES, kinds_of
+from asm_gym.monitors import make_monitor
 from asm_gym.monitors.monitor_registry import BY_EVIDENCE, check_monitor_name
 from asm_gym.rollouts.detection_corpus import SKILLS, VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map
@@ -28,7 +31,8 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.run_trials import record_missing
 from asm_gym.rollouts.trial import RolloutConfig, Trial, evaluation_trials
-from asm_gym.scripts.command import Options, option, origin, run
+from asm_gym.scripts.command import Options, one_line, option, origin, run
+from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 from asm_gym.validation import check_choice, check_number
 
@@ -139,6 +143,26 @@ class Args(Options):
         return RolloutConfig(self.policy)
 
 
+def without_unfit_monitors(args: Args, console: Console) -> Args:
+    """Leave out the monitors that cannot watch the environment, and say which. Raises ValueError for all of them."""
+    if not args.elsewhere:
+        return args
+    with closing(gym.make(env_id(args.tasks[0]), **dict(args.config.settings))) as env:
+        spec = StreamSource(env).spec
+    fit = []
+    reasons = []
+    for name in args.monitors:
+        try:
+            make_monitor(name, spec)
+            fit.append(name)
+        except ValueError as error:
+            reasons.append(one_line(error))
+            console.print(f"{name} is left out: {reasons[-1]}", highlight=False)
+    if not fit:
+        raise ValueError(f"no monitor can watch this: {reasons[0]}")
+    return replace(args, monitors=tuple(fit))
+
+
 def trials_of(args: Args, task: str) -> list[Trial]:
     """Return every trial of a task."""
     return evaluation_trials(
@@ -154,6 +178,7 @@ def trials_of(args: Args, task: str) -> list[Trial]:
 
 def evaluate(args: Args, console: Console) -> None:
     """Record, fit, judge and publish; print the tables in brief."""
+    args = without_unfit_monitors(args, console)
     seconds: dict[str, float] = {}  # of each stage
     claim = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     trials = []
