@@ -302,6 +302,11 @@ def test_an_interval_of_a_mean_is_students():
     assert Estimate.of_mean([2.0]).text() == "2.0"
 
 
+def test_small_actions_move_the_hand_less_and_the_fingers_as_before():
+    found = learning_safely.smaller(0.5, np.ones((2, 7), np.float32))
+    assert found.tolist() == [[0.5] * 6 + [1.0]] * 2
+
+
 def test_every_run_of_the_study_has_a_file_of_its_own():
     config = learning_safely.Config(algorithms=learning_safely.ALGORITHMS)
     wanted = learning_safely.runs(config)

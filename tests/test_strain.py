@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
-from asm_gym.envs.arms import bodies
-from asm_gym.envs.strain import AT_STOP, GRIPPER, LINK, self_contacts
+from asm_gym.envs.arms import AT_STOP, bodies
+from asm_gym.envs.strain import GRIPPER, LINK, self_contacts
 from asm_gym.policies import make_policy, rollout
 
 DOWN = np.array([0, 0, -1, 0, 0, 0, 1], np.float32)

@@ -38,7 +38,7 @@ ODD_EPISODES = 0.002
 MOMENTUM = 2.3
 """Limit of a hand or link where no healthy hand was: 15 kg at the usual speed [N s]. MuJoCo's contacts answer with
 about 105/s times that."""
-PACE_MOMENTUM = 3.0  # where one was [N s]
+PACE_MOMENTUM = 3.0  # of a hand where one was [N s]
 
 TILTING = [3, 4, 9, 10]  # of the 12 directions, about the horizontal axes
 TILTED_SPEED = 0.5  # in most places hands of a task that tilts them turn faster [rad/s]
@@ -51,7 +51,7 @@ class HandSpeedMap:
     Args:
         cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of the momentum of an arm's hand and links, where no healthy hand was [N s].
-        pace_momentum: the same where one was [N s].
+        pace_momentum: that of a hand where one was [N s].
 
     Raises:
         ValueError: cells of another shape, places that are too far away, or negative speeds.

@@ -22,6 +22,7 @@ from asm_gym.envs.mujoco_views import (
 )
 
 PHYSICS_FREQ = 500  # robosuite's physics rate [Hz]
+AT_STOP = 0.01  # a joint so near to the end of its range is at its stop [rad]
 CHANGES = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes of the arm's pose
 SLOWED = (*CHANGES, "OSC_POSITION")  # controllers whose actions tell how fast the hand will go
 Part = tuple[Any, str]  # one of robosuite's robots, and the name of one of its arms
@@ -95,6 +96,7 @@ def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
     arm.dofs[:joints] = robot._ref_joint_vel_indexes
     arm.motors[:joints] = robot._ref_actuators_indexes_dict[name]
     arm.gears[:joints] = model.actuator_gear[arm.motors[:joints], 0]
+    arm.lowest[:joints], arm.highest[:joints] = free_angles(model, robot._ref_joint_indexes)
     arm.site = robot.eef_site_id[name]
     arm.site_body = model.site_bodyid[arm.site]
     arm.root = model.body_rootid[arm.site_body]
@@ -129,6 +131,13 @@ def _fill_settings(arm: Arm, model: mujoco.MjModel, controller: Any) -> None:
         arm.frame = _base_site(model, controller)
     else:
         arm.controller = JOINT_POSITION
+
+
+def free_angles(model: mujoco.MjModel, joints: Any) -> tuple[Floats, Floats]:
+    """Return the least and the greatest angle of each joint that is not at a stop [rad]; infinite without stops."""
+    limited = model.jnt_limited[joints].astype(bool)[:, None]
+    ranges = np.where(limited, model.jnt_range[joints], (-np.inf, np.inf))
+    return ranges[:, 0] + AT_STOP, ranges[:, 1] - AT_STOP
 
 
 def _base_site(model: mujoco.MjModel, controller: Any) -> int:

@@ -56,6 +56,7 @@ class Views(NamedTuple):
     subtree_com: Floats  # (nbody, 3)
     xpos: Floats  # (nbody, 3)
     xmat: Floats  # (nbody, 9)
+    geom_xpos: Floats  # (ngeom, 3)
     site_xpos: Floats  # (nsite, 3)
     site_xmat: Floats  # (nsite, 9)
     sensordata: Floats
@@ -109,6 +110,12 @@ ARM = np.dtype(
         ("controller", np.int64),  # OSC_POSE or JOINT_POSITION
         ("kp", np.float64, JOINTS),
         ("kd", np.float64, JOINTS),
+        (
+            "lowest",
+            np.float64,
+            JOINTS,
+        ),  # between these a joint is free, beyond them at its stop [rad]
+        ("highest", np.float64, JOINTS),
         ("rest_angles", np.float64, JOINTS),  # the posture that spare joints tend to [rad]
         ("first_input", np.int64),  # where the arm's part of the action begins
         ("input_count", np.int64),  # how many numbers it has

@@ -25,6 +25,7 @@ NEAR = 0.06
 
 LOOK_AGAIN_EVERY = 5  # substeps
 LOOK_AGAIN_WITHIN = 0.02  # [m]
+NUDGE = 1e-5  # moves a geom to where its distance is found again [m]
 WORLD = 0  # the body that all others stand on
 
 link_library()
@@ -164,6 +165,30 @@ def belongs_to_hand(arm: Any, geom: int) -> bool:
 
 
 @inner
+def nearest_points(
+    model: int, data: int, places: Floats, geom: int, other: int, ends: Floats
+) -> float:
+    """Write the nearest points of two geoms into ``ends`` (2, 3), where they are within ``NEAR``; return the gap [m].
+
+    MuJoCo 3.3.5 to 3.10 says of some convex geoms that are apart that they are exactly 0 apart, and tells points that
+    lie anywhere on them (google-deepmind/mujoco issue 3383). A hundredth of a millimetre away it finds the right ones.
+
+    Args:
+        model, data: their addresses.
+        places: (ngeom, 3) of the geoms; those of ``geom`` are as before on return.
+    """
+    gap = _distance(model, data, geom, other, NEAR, ends.ctypes.data)
+    for axis in range(3):
+        if gap != 0.0:
+            break
+        place = places[geom, axis]
+        places[geom, axis] = place + NUDGE
+        gap = _distance(model, data, geom, other, NEAR, ends.ctypes.data)
+        places[geom, axis] = place
+    return gap
+
+
+@inner
 def note_geom(arm: Any, geom: int, link: int, ahead: Ahead, a: int) -> None:
     """Note the points of a geom of a link that are near something."""
     for other in arm.others:
@@ -175,7 +200,7 @@ def note_geom(arm: Any, geom: int, link: int, ahead: Ahead, a: int) -> None:
             continue
         if box_distance(arm, geom, other) > NEAR + arm.radii[geom]:
             continue
-        gap = _distance(arm.model, arm.data, geom, other, NEAR, arm.ends.ctypes.data)
+        gap = nearest_points(arm.model, arm.data, arm.places, geom, other, arm.ends)
         if gap < NEAR:
             point = point_to_keep(ahead, a, link, gap)
             if point >= 0:
@@ -195,8 +220,8 @@ def look_again(views: Any, arm: Any, a: int, ahead: Ahead, ends: Floats) -> None
         for k in range(ahead.counts[a, n]):
             near = ahead.points[a, n, k]
             if near.gap < LOOK_AGAIN_WITHIN:
-                gap = _distance(
-                    views.model, views.data, near.geom, near.obstacle, NEAR, ends.ctypes.data
+                gap = nearest_points(
+                    views.model, views.data, views.geom_xpos, near.geom, near.obstacle, ends
                 )
                 write_point(views.xpos[body], views.xmat[body], ends, gap, near)
         n += 1

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.envs.arm_brake import (
     Approach,
+    closing_speed,
     how_soon,
     is_beside_base,
     present_gap,
@@ -170,7 +171,7 @@ def asks_soon(views: Views, arm: Arm, ahead: Ahead, a: int, motion: Motion) -> f
         point = ahead.points[a, 0, k]
         gap = present_gap(views, arm.links[0], point, motion.place)
         x, y, z = velocity_at(motion.turning_first, motion.place, views.site_xpos[arm.site])
-        most = max(most, how_soon(point.way, gap, x, y, z))
+        most = max(most, how_soon(closing_speed(point.way, x, y, z), gap))
     return most
 
 
@@ -224,7 +225,7 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         momentum = 0.0
         if soon > 0.0 and limit.momentum < np.inf:
             momentum = soon * asked_momentum(views, motion)
-        approach = Approach(soon=soon, momentum=momentum, leans=False)
+        approach = Approach(soon=soon, momentum=momentum, link_momentum=0.0, leans=False)
         share = share_at(views, arm, a, limit, motion.twist, approach)
         brake_speeds[a] = max(limit.hand_speed, share * twist_speed(motion.twist))
         if share < 1.0:

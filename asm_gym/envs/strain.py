@@ -8,10 +8,8 @@ import mujoco
 import numpy as np
 
 from asm_gym.compilation import compiled
-from asm_gym.envs.arms import Part, bodies
+from asm_gym.envs.arms import Part, bodies, free_angles
 from asm_gym.envs.mujoco_views import Floats, Ints
-
-AT_STOP = 0.01  # a joint so near to the end of its range is at its stop [rad]
 
 # Geoms by what they belong to.
 ELSEWHERE = 0
@@ -39,10 +37,7 @@ class StrainSensor:
         self._data = data
         joints = np.concatenate([robot._ref_joint_indexes for robot, _ in parts])
         self._angles = model.jnt_qposadr[joints]
-        limited = model.jnt_limited[joints].astype(bool)[:, None]
-        ranges = np.where(limited, model.jnt_range[joints], (-np.inf, np.inf))
-        self._low = ranges[:, 0] + AT_STOP
-        self._high = ranges[:, 1] - AT_STOP
+        self._low, self._high = free_angles(model, joints)
 
         kind_of_body = np.full(model.nbody, ELSEWHERE)
         for robot, _ in parts:

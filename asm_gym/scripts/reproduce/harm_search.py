@@ -64,6 +64,8 @@ class HardestContact:
 
     def __init__(self, arm: Any) -> None:
         self._arm = arm
+        self._model: Any = None
+        self._is_arm = np.zeros(0, bool)  # of each geom
         self._speeds: deque[float] = deque(maxlen=APPROACH_SUBSTEPS)
         self.force = 0.0
         self.bodies = ("", "")
@@ -72,7 +74,10 @@ class HardestContact:
     def __call__(self, substep: int) -> None:
         simulation = self._arm.simulation
         data = simulation.data
-        touching = _touching(simulation)
+        if simulation.model is not self._model:
+            self._model = simulation.model
+            self._is_arm = _is_arm(simulation)
+        touching = np.flatnonzero(self._is_arm[data.contact.geom].any(axis=1))
         rows = data.contact.efc_address[touching]
         rows = rows[rows >= 0]
         approach = 0.0
@@ -87,13 +92,12 @@ class HardestContact:
             self.bodies = _pressing(simulation, touching)
 
 
-def _touching(simulation: Any) -> NDArray[np.intp]:
-    """Return the contacts of the arms with anything."""
+def _is_arm(simulation: Any) -> NDArray[np.bool_]:
+    """Return which geoms are of an arm, its hand and fingers included."""
     model = simulation.model
     roots = model.body_rootid[simulation.arms.root]
     is_arm = np.isin(model.body_rootid, roots) & (model.body_weldid != 0)
-    bodies = model.geom_bodyid[simulation.data.contact.geom]
-    return np.flatnonzero(is_arm[bodies].any(axis=1))
+    return is_arm[model.geom_bodyid]
 
 
 def _pressing(simulation: Any, touching: NDArray[np.intp]) -> tuple[str, str]:

@@ -18,9 +18,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 import torch
 from gymnasium.vector import VectorEnv
+from gymnasium.wrappers.vector import TransformAction
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -43,6 +45,7 @@ from asm_gym.wrappers import VectorNeuralASMSafety
 ALONE = "alone"
 DEFAULT = "default"
 SLOW = 0.15  # of the fixed speed limit [m/s]
+SMALL = 0.3  # share of the actions with which a hand goes as fast as the guard lets it go where nothing is near
 GOING_ON = {cause: "go on" for cause in CAUSES if not cause.endswith(PRESSING)}
 
 
@@ -54,6 +57,8 @@ class Way:
     """Settings of the wrapper; None for no guard."""
     hand_speed: float = math.inf
     """A fixed limit of the hand's speed, without a guard [m/s]."""
+    action_share: float = 1.0
+    """What a full action of the agent is of one of the environment; that of the fingers stays."""
     price: float = 0.0
     """What a step in alarm costs, in reward."""
     cost_limit: float | None = None
@@ -65,12 +70,13 @@ WAYS = {
     DEFAULT: Way(guard={}),
     "contact limits": Way(guard={"responses": GOING_ON}),
     "speed limit": Way(hand_speed=SLOW),
+    "small actions": Way(action_share=SMALL),
     "cost in reward": Way(guard={"on_alarm": "monitor"}, price=0.1),
     "Lagrangian": Way(guard={"on_alarm": "monitor"}, cost_limit=0.05),
     "truncated": Way(guard={"on_alarm": "terminate", "truncate": True}),
 }
 """Ways by name. *contact limits* goes on at every alarm that is no pressing; *truncated* truncates the episode at an
-alarm."""
+alarm; *small actions* tells what slow hands alone cost."""
 PRICED = ("cost in reward", "Lagrangian")  # ways of PPO alone
 PRICE_RATE = 0.2  # of the price that follows a limit, for each rollout
 
@@ -185,9 +191,16 @@ def recorded(envs: VectorEnv[Any, Any, Any], way: Way) -> LearningRecord:
     """Return a vector under the guard of a way, with a record of its episodes."""
     if math.isfinite(way.hand_speed):
         envs = SpeedLimited(envs, way.hand_speed)
+    if way.action_share < 1.0:
+        envs = TransformAction(envs, partial(smaller, way.action_share))
     if way.guard is not None:
         envs = VectorNeuralASMSafety(envs, **way.guard)
     return LearningRecord(envs)
+
+
+def smaller(share: float, actions: Any) -> Any:
+    """Return actions (N, A) that move hands by a share of what they did; the last number moves the fingers."""
+    return np.concatenate([share * actions[:, :-1], actions[:, -1:]], axis=1)
 
 
 class Learner(NamedTuple):
