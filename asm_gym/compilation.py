@@ -102,6 +102,16 @@ def must_compile(function: Any) -> bool:
     return not any(processor in key for key in cache._load_index())
 
 
+def announce(function: Any, what: str) -> bool:
+    """Return whether the next call of a compiled function compiles ``what``; say so on standard error."""
+    if not must_compile(function):
+        return False
+    print(
+        f"asm-gym: compiling {what}, once on this machine (half a minute to two)", file=sys.stderr
+    )
+    return True
+
+
 def kept_in(function: Any) -> Path | None:
     """Return the folder that holds the compiled code of a function; None where nothing keeps it."""
     cache = _cache_of(function)

@@ -32,14 +32,14 @@ from asm_gym.memory.association_learning import (
     thirds,
 )
 from asm_gym.memory.linear_association import LEAST_VARIANCE, conditional, inverse_of, moments
-from asm_gym.memory.recurrent import (
+from asm_gym.memory.recurrent import RecurrentWeights
+from asm_gym.memory.recurrent_learning import (
     Eligibility,
     Errors,
-    RecurrentWeights,
     initial_recurrent_weights,
     local_change,
 )
-from asm_gym.memory.recurrent import Wiring as RecurrentWiring
+from asm_gym.memory.recurrent_learning import Wiring as RecurrentWiring
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scaling import ScaledRows
 from tests.problems import CHANGES, called, energy

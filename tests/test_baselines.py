@@ -9,7 +9,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.monitors import MONITORS, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
-from tests.streams import sine_episodes, sine_spec
+from tests.streams import sine_episodes
 
 SPEC = StreamSpec(
     (
@@ -108,34 +108,6 @@ def test_bad_episodes_and_order_are_refused(monitor):
         monitor.calibrate(episodes(3, seed=1), 0.05)
     with pytest.raises(ValueError, match="numbers a step"):
         monitor.observe(monitor.initial_state(1), np.zeros((1, 3)))
-
-
-def test_limits_are_what_they_say():
-    force = make_monitor("force_limit", SPEC).fit(episodes(5))
-    torque = make_monitor("external_torque_limit", SPEC).fit(episodes(5))
-    rows = np.concatenate([e.stream for e in episodes(5)]).astype(float)
-    row = np.arange(float(SPEC.size))[None]
-    weight, mean, spread = (
-        rows[:, 3:6].mean(axis=0),
-        rows[:, :3].mean(axis=0),
-        rows[:, :3].std(axis=0),
-    )
-    assert force.observe(force.initial_state(), row)[1].value[0] == pytest.approx(
-        ((row[0, 3:6] - weight) ** 2).sum()
-    )
-    expected = np.abs(row[0, :3] - mean) / spread
-    surprise = torque.observe(torque.initial_state(), row)[1]
-    assert surprise.value[0] == pytest.approx(expected.max())
-    assert surprise.attribution[0].argmax() == expected.argmax()
-
-
-@pytest.mark.parametrize(
-    ("name", "lacks"),
-    [("force_limit", "wrist_force"), ("external_torque_limit", "external_torque")],
-)
-def test_a_limit_needs_its_channel(name, lacks):
-    with pytest.raises(ValueError, match=f"no {lacks}.*joint_position"):
-        make_monitor(name, sine_spec())
 
 
 def test_unknown_names_and_hyperparameters_list_the_known():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -60,24 +59,6 @@ def test_every_command_prints_its_help(name, capsys):
     assert f"usage: asm-gym {name}" in shown
     assert "default: ''" not in shown
     assert "{None}" not in shown
-
-
-def completed(*words: str) -> list[str]:
-    """What bash offers for the last of the words."""
-    ask = (
-        f"{sys.executable} -m asm_gym completion bash > script && source ./script && "
-        f"COMP_WORDS=({shlex.join(words)}) COMP_CWORD={len(words) - 1} && _asm_gym && "
-        'echo "${COMPREPLY[@]}"'
-    )
-    return subprocess.check_output(["bash", "-c", ask], text=True).split()
-
-
-def test_bash_completes_commands_options_and_studies(tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    monkeypatch.chdir(tmp_path)
-    assert completed("asm-gym", "fi") == ["fit"]
-    assert completed("asm-gym", "fit", "logs", "--false-alarms") == ["--false-alarms-per-hour"]
-    assert completed("asm-gym", "reproduce", "rep") == ["repertoire"]
 
 
 @pytest.mark.parametrize("name", EVERY_COMMAND)

@@ -58,7 +58,7 @@ def test_any_model_goes_under_any_detection(detection):
 
 
 def test_a_name_with_a_plus_is_a_model_under_a_detection():
-    for name, detection in (("kalman+evidence", "evidence"), ("force_limit+squares", "squares")):
+    for name, detection in (("kalman+evidence", "evidence"), ("kalman+squares", "squares")):
         assert monitor_class(name).detection == detection
     assert make_monitor("kalman+evidence", sine_spec()).detection.name == "evidence"
     with pytest.raises(ValueError, match="unknown detection 'oracle'; known: evidence"):

@@ -160,7 +160,7 @@ def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twent
 
 
 def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_path):
-    monitor = make_monitor("force_limit", gym.make("asm_gym/Lift-v0").unwrapped.stream_spec)
+    monitor = make_monitor("kalman", gym.make("asm_gym/Lift-v0").unwrapped.stream_spec)
     episodes = collect("asm_gym/Lift-v0", policy="hold", episodes=4, horizon=10)
     monitor.fit(episodes[:2]).calibrate(episodes[2:], 0.5)
     peaks = np.concatenate([e.stream[:, e.spec.slices["wrist_force_peak"]] for e in episodes[2:]])

@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.data.episode import EpisodeLabel, load_episode
@@ -11,7 +10,7 @@ from asm_gym.scripts import command
 from asm_gym.scripts.evaluate import Args, main, trials_of
 from asm_gym.version import __version__
 
-MONITORS = ("neural_asm", "kalman+evidence", "association_linear", "force_limit")
+MONITORS = ("neural_asm", "kalman+evidence", "association_linear")
 SMALL = [
     *(
         "--tasks",
@@ -38,12 +37,9 @@ def run(tmp_path_factory):
     return folder
 
 
-def test_it_writes_a_table_a_row_for_each_episode_and_a_report(run):
-    rows = pq.read_table(run / "results.parquet").to_pylist()
-    assert len(rows) == len(MONITORS) * (4 + 3 * 2 * 2)
-    push = [r for r in rows if r["kind"] == "push" and r["severity"] == "strong"]
-    assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
-    assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
+def test_it_writes_tables_and_a_report(run):
+    tables = (run / "results.md").read_text()
+    assert all(name in tables for name in MONITORS)
     report = (run / "report.html").read_text()
     assert "ideal observer" in report
     assert f"asm-gym {__version__}" in report
@@ -85,7 +81,7 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--faults flood", "'flood'.*push"),
         ("--tasks Juggle", "'Juggle'.*Lift"),
         ("--monitors oracle", "'oracle'.*neural_asm"),
-        ("--monitors force_limit+magic", "'magic'.*evidence"),
+        ("--monitors kalman+magic", "'magic'.*evidence"),
         ("--severities deadly", "'deadly'.*mild"),
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
         ("--faulty-episodes 5", "at most 4, got 5"),

@@ -274,7 +274,7 @@ def judged(peak, kind="nominal", severity="", onset=None):
 
 
 def visibility(separation, kind="push", severity="strong", delay=0.05):
-    return Detectability("Lift", kind, severity, 0, separation, delay)
+    return Detectability(kind, severity, separation, delay)
 
 
 NOMINAL = [judged(p) for p in (1.0, 2.0, 3.0, 4.0)]
@@ -421,7 +421,7 @@ def test_the_lead_over_a_monitor_that_judged_alike_is_nothing():
     one = DetectionMetrics(
         "asm", faulty, nominal, 0.5, Calibration({FIVE: 1.0}, np.linspace(0.5, 1.1, 60))
     )
-    seen = [Detectability("Lift", "push", "", t.seed, 100.0, 0.1) for t in faulty]
+    seen = [Detectability("push", "", 100.0, 0.1) for _ in faulty]
     table = lead_table(
         BenchmarkResult({"asm": one, "twin": replace(one, name="twin")}, seen, 0.05, 0.5)
     )

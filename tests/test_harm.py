@@ -65,6 +65,16 @@ def test_what_is_kept_away_is_of_the_policy_alone_and_cells_without_harm_do_not_
     assert (told[5][""], told[5]["kept away"]) == ("Panda, 20 Hz, Lift, forward", "90.0 %")
 
 
+def test_groups_of_the_same_episodes_are_one_row_and_tables_of_the_same_rows_are_one():
+    records = [record(g, 0, v, "scripted", "healthy") for g, v in ((ALONE, 9.0), (DEFAULT, 1.0))]
+    frame = pd.DataFrame(records)
+    table = harm.by_guard("", frame, [ALONE, DEFAULT], harm.CASE, ("kind",))
+    assert len(table.rows) == 2
+    again = harm.by_guard("again", frame, [ALONE, DEFAULT], ("policy",))
+    none = harm.by_guard("none", frame[:0], [ALONE], ("policy",))
+    assert harm.without_repeats([none, table, again]) == [table]
+
+
 def test_success_is_paired_by_scene_and_counted_without_a_blow():
     records = []
     for policy, seed, alone, guarded, blow in (
@@ -108,7 +118,7 @@ def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypa
         "--quick",
         "--guards",
         ALONE,
-        "hold",
+        "0.15 m/s",
         "--against",
         "hostile",
         "--workers",
@@ -118,8 +128,8 @@ def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypa
     ]
     assert main("harm", harm, asked) == 0
     text = (tmp_path / "harm.md").read_text()
-    assert "| hold |" in text
-    assert "terminate" not in text
+    assert "| 0.15 m/s |" in text
+    assert "0.25 m/s" not in text
     assert "Lift, down, 0.25 of full speed" in text
 
 

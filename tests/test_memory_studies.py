@@ -7,7 +7,11 @@ import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.recurrent import Eligibility, RecurrentLearner, initial_recurrent_weights
+from asm_gym.memory.recurrent_learning import (
+    Eligibility,
+    RecurrentLearner,
+    initial_recurrent_weights,
+)
 from asm_gym.memory.settling import learn_settling
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import closed_loop, memorise_and_recall, skill_measures, workspace

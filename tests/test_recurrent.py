@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.memory.carried_readout import direct, sense
 from asm_gym.memory.energy import Inference, infer, outward
-from asm_gym.memory.recurrent import (
+from asm_gym.memory.recurrent import RecurrentWeights, advance, direct, sense
+from asm_gym.memory.recurrent_learning import (
     Change,
     Eligibility,
     Errors,
-    RecurrentWeights,
     Wiring,
-    advance,
     follow_eligibility,
     initial_recurrent_weights,
     local_change,

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.detection.conformal import Blocks
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.rollouts.pretraining.body_evaluation import Scores, promises_table
@@ -69,18 +68,13 @@ def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
     with (tmp_path / f"{study}.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     table = (tmp_path / f"{study}.md").read_text()
-    if study in (
-        "harm",
-        "chunks",
-        "learning",
-        "wear",
-    ):  # which count episodes or have intervals; the others have means ± deviations and a figure
-        assert rows
-        assert "|" in table
-    else:
+    assert rows
+    assert "|" in table
+    if study in ("memorise_and_recall", "repertoire", "panda"):
         assert {r["seed"] for r in rows} >= {"3", "4"}
         assert "±" in table
         assert "±" in capsys.readouterr().out
+    if study in ("repertoire", "panda"):
         assert (tmp_path / f"{study}.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -137,22 +131,3 @@ def test_promises_over_halves_come_true_where_all_hours_are_alike():
     came = [float(cell.split()[0]) for cell in table.rows[0]]
     np.testing.assert_allclose(came, hours.PROMISES, rtol=0.25)
     assert all("50.0 ± 0.0 % found" in cell for cell in table.rows[0])
-
-
-def test_an_e_detector_alarms_no_more_often_than_promised_and_lets_weak_evidence_add_up():
-    rng = np.random.default_rng(0)
-    peaks = rng.exponential(size=40_000)
-    detector, alarms = hours.EDetector(Blocks(peaks[:20_000], np.full(20_000, 0.01)), rate=2.0), 0
-    for peak in peaks[20_000:]:
-        alarms += peak > detector.value
-        detector.follow(peak)
-    assert 0.2 < alarms / 200 / 2.0 < 1.0  # in 200 hours of the same policy
-    fresh = hours.EDetector(Blocks(peaks[:20_000], np.full(20_000, 0.01)), rate=2.0)
-    thresholds = []
-    for _ in range(5):
-        thresholds.append(fresh.value)
-        fresh.follow(5.0)  # such as one block in 150 reaches
-    assert np.diff(thresholds)[: int(np.argmax(np.array(thresholds) < 5.0))].max() < 0
-    assert min(thresholds) < 5.0  # the alarm comes, though no episode alone would raise it
-    # what the hourly threshold of this promise is
-    assert thresholds[0] > np.quantile(peaks, 1 - 1 / 50)

@@ -204,10 +204,18 @@ def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
 # ------------------------------------------------------------------ progress
 
 
+def test_progress_goes_to_standard_error_so_that_results_can_be_piped(capsys):
+    with progress.stage("recording") as tell:
+        tell(12, 12)
+    shown = capsys.readouterr()
+    assert not shown.out
+    assert "recording: 12 of 12, done in" in shown.err
+
+
 def test_in_a_pipe_progress_is_a_line_now_and_then_and_in_a_terminal_a_bar(monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
     out, seconds = io.StringIO(), {}
-    with progress.stage("recording [all]", Console(file=out), seconds) as tell:
+    with progress.stage("recording [all]", seconds, Console(file=out)) as tell:
         tell(3, 12)
         tell(12, 12)
     assert out.getvalue().splitlines() == [
@@ -217,6 +225,8 @@ def test_in_a_pipe_progress_is_a_line_now_and_then_and_in_a_terminal_a_bar(monke
     ]
     assert set(seconds) == {"recording [all]"}
     out = io.StringIO()
-    with progress.stage("recording", Console(file=out, force_terminal=True, width=80)) as tell:
+    with progress.stage(
+        "recording", console=Console(file=out, force_terminal=True, width=80)
+    ) as tell:
         tell(3, 12)
     assert "12/12" in out.getvalue()

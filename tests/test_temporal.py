@@ -27,11 +27,10 @@ from asm_gym.memory.learning import (
     one_after_another,
 )
 from asm_gym.memory.recall import follow, run_on
-from asm_gym.memory.recurrent import (
+from asm_gym.memory.recurrent import RecurrentNetwork, advance
+from asm_gym.memory.recurrent_learning import (
     RecurrentLearner,
-    RecurrentNetwork,
     Wiring,
-    advance,
     initial_recurrent_weights,
     learn_recurrent,
 )

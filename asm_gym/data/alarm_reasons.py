@@ -16,7 +16,6 @@ NOT_FINITE = "not finite"
 LATE = "late"
 
 MOST_SHOWN = 1000.0  # thresholds, above which a number tells a reader nothing more
-TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
 
 
 def thresholds_shown(excess: float) -> str:

@@ -39,7 +39,7 @@ KNOWN_ACTIONS = (
     KnownActions(
         r"Hand(Reach|Manipulate).*",
         (TARGET,),
-        "gymnasium_robotics/envs/shadow_dexterous_hand/hand_env.py, _set_action without relative_control",
+        "gymnasium_robotics/envs/shadow_dexterous_hand/hand_env.py, absolute control",
     ),
     KnownActions(
         r"(Point|Ant)Maze.*",
@@ -49,7 +49,7 @@ KNOWN_ACTIONS = (
     KnownActions(
         r"Panda(Reach|Push|Slide|PickAndPlace|Stack|Flip)(Joints)?(Dense)?-v\d+",
         (DELTA,),
-        "panda_gym/envs/robots/panda.py, set_action: displacements of the hand or joints, and of the fingers",
+        "panda_gym/envs/robots/panda.py, set_action: displacements of hand or joints, and fingers",
     ),
     KnownActions(
         r"Meta-World/.*",

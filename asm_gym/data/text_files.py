@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from asm_gym.data.column_names import element_name
 from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import MOST_COLUMNS, Columns, check_width
-from asm_gym.data.text_exports import check_export, on_first_clock, scope_head, with_unit
+from asm_gym.data.text_exports import check_export, with_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -117,16 +117,13 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     lines, is_whole = _lines(path)
     top = lines.iloc[:FIRST_LINES].tolist()
     check_export(top)
-    start, scope = scope_head(top)
-    if not scope and not columns:
+    start = 0
+    if not columns:
         start = _header_place(top)
         if start:
             note(f"{path}: its first {start} lines stand above the table, and are left out")
-    table = _table(path, lines.iloc[start:], scope or columns)
-    values = _columns(path, table, is_whole)
-    if scope:
-        values = on_first_clock(values)
-    return _by_name(table.names, values)
+    table = _table(path, lines.iloc[start:], columns)
+    return _by_name(table.names, _columns(path, table, is_whole))
 
 
 def _lines(path: Path) -> tuple[pd.Series[str], bool]:

@@ -57,8 +57,8 @@ class FollowingThreshold:
             kept = _read(path)
             if not math.isclose(kept["calibrated"], calibrated, rel_tol=1e-9):
                 raise ValueError(
-                    f"{path} is of a memory with the threshold {kept['calibrated']:.6g}, and this one "
-                    f"has {calibrated:.6g}: give another file"
+                    f"{path} is of a memory with the threshold {kept['calibrated']:.6g}, "
+                    f"and this one has {calibrated:.6g}: give another file"
                 )
             running.log = kept["log"]
             running.episodes = int(kept["episodes"])

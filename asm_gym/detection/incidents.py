@@ -146,6 +146,12 @@ class IncidentBook:
         strengths = strengths_of(row, self._power)
         if not surprising:
             return self._open_first(row, strengths)
+        return self._follow_others(surprising, row, strengths)
+
+    def _follow_others(
+        self, surprising: list[Incident], row: AlarmRow, strengths: Floats
+    ) -> Incident | None:
+        """Take up a row of these strengths (D,) while such incidents are open."""
         known = np.logical_or.reduce([i.known for i in surprising])
         settling = [i for i in surprising if i.settles(row.time)]
         rest = np.where(known, 0.0, strengths)

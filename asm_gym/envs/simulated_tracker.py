@@ -136,7 +136,7 @@ class TrackedHand:
         self._quality = quality
         self.track = new_track()
         self._hand = new_hand()
-        # Views of their fields, each an array (1, ...): an attribute of a record takes microseconds.
+        # Views of their fields, each an array (1, ...): a record's attribute takes microseconds.
         self._tracks = views_of(self.track)
         self._hands = views_of(self._hand)
         self._numbers = np.zeros(SENSED)

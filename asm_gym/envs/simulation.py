@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import Bound, bind, must_compile
+from asm_gym.compilation import Bound, announce, bind
 from asm_gym.detection.contact_limits import FREE_FORCE, ContactLimits
 from asm_gym.detection.hand_speed import NO_SPEED_LIMIT
 from asm_gym.envs import compiled_substeps as kernels
@@ -102,11 +101,7 @@ class Simulation:
         self._take_up_controllers()
         self._clear_limits()
 
-        if must_compile(kernels.run):
-            print(
-                "asm-gym: compiling the simulation loop, once on this machine (about 10 s)",
-                file=sys.stderr,
-            )
+        if announce(kernels.run, "the simulation loop"):
             self._run(0)
         kernels.sample(self.views, self.nominal.now(), self.arms, 0, self._samples)
         self._summarise(1)

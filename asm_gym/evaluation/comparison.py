@@ -44,10 +44,8 @@ IDEAL = "ideal observer"
 class Detectability(NamedTuple):
     """What the ideal observer could detect of one faulty episode."""
 
-    task: str
     kind: str
     severity: str
-    seed: int
     separation: float  # S at the end of the window
     delay: float | None  # time from the onset until the observer is sure [s]; None if never
 
@@ -121,10 +119,8 @@ def detectability_of(
             delay = (sure + 1) * dt
         detectability.append(
             Detectability(
-                task=label.task,
                 kind=label.kind,
                 severity=label.severity,
-                seed=label.seed,
                 separation=float(window.max(initial=0.0)),
                 delay=delay,
             )

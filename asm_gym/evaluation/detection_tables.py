@@ -242,7 +242,7 @@ def _lead(difference: Estimate, scale: float, digits: int) -> str:
     return f"{value} ({low} to {high}), {verdict}"
 
 
-# ------------------------------------------------------------------ promises and actual false alarms
+# ------------------------------------------------------------------ promises and false alarms
 
 
 def kept_table(result: BenchmarkResult) -> Table:

@@ -52,10 +52,10 @@ class Alarm(NamedTuple):
     """One alarm of a recording: an incident."""
 
     log: str
-    # Stamps of its first and last row, by the log's own clock; without one, the ends of their steps [s].
+    # Stamps of its first and last row [s], by the log; without a clock, the ends of their steps.
     start: float
     end: float
-    # The channel that blame points to when the alarm was raised; empty where a whole row was missing.
+    # The channel that blame points to at its first row; empty where a whole row was missing.
     channel: str
     why: str  # surprise, missing data, or not finite
     excess: float  # surprise of the worst row, in thresholds

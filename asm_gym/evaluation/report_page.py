@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import io
-import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 
 from asm_gym.evaluation.comparison import BenchmarkResult
@@ -25,11 +22,7 @@ from asm_gym.evaluation.detection_tables import (
     splits_table,
 )
 from asm_gym.evaluation.tables import Table, markdown
-from asm_gym.extras import require
-from asm_gym.files import write_text, written_whole
-
-COPIED = ("task", "monitor", "kind", "severity", "seed", "onset")
-"""Columns of ``results.parquet`` that are fields of a scored episode."""
+from asm_gym.files import write_text
 
 FEWEST_SPACES = 3  # between the words of a sentence
 
@@ -123,10 +116,7 @@ def _figure(caption: str, figure: Figure) -> str:
 
 
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -> None:
-    """Write ``results.parquet``, ``results.md`` and ``report.html``."""
-    require("pyarrow", what="results.parquet")
-    with written_whole(folder / "results.parquet") as file:
-        pd.DataFrame(_rows(result)).to_parquet(file, index=False)
+    """Write ``results.md`` and ``report.html``."""
     tables = [monitors_table(result), kept_table(result), splits_table(result), kinds_table(result)]
     if len(result.monitors) > 1:
         tables.insert(1, lead_table(result))
@@ -137,35 +127,3 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         "monitor can do better than its row."
     )
     write_report(folder / "report.html", "Who notices what", intro, tables, {}, details=details)
-
-
-def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:
-    """Yield what each monitor made of each episode."""
-    detectability = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
-    for monitor in result.monitors.values():
-        for trace in (*monitor.nominal, *monitor.traces):
-            row = {name: getattr(trace, name) for name in COPIED}
-            row |= {
-                "steps": len(trace),
-                "dt": trace.dt,
-                "threshold": trace.threshold,
-                "alarm": bool(trace.alarms),
-                "detected": None,
-                "delay_s": trace.delay,
-                "peak_in_window": float(
-                    trace.surprise[trace.window(result.window_s)].max(initial=0.0)
-                ),
-                "blamed": None,
-                "ideal_separation": None,
-                "ideal_delay_s": None,
-                "surprise": np.asarray(trace.surprise, np.float32),
-            }
-            if trace.onset is not None:
-                row["detected"] = math.isfinite(trace.delay_within(result.window_s))
-            if trace.detected_after is not None:
-                row["blamed"] = trace.top_channel
-            ideal = detectability.get((trace.task, trace.kind, trace.severity, trace.seed))
-            if ideal is not None:
-                row["ideal_separation"] = ideal.separation
-                row["ideal_delay_s"] = ideal.delay
-            yield row

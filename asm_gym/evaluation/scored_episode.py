@@ -76,7 +76,7 @@ class ScoredEpisode:
     # stamp of the first row, by the log's own clock; None without one [s]
     origin: float | None = None
     power: float = 1.0  # by which the detection pools the channels, for incidents
-    # by row, the shares (D,) of the channels in its surprise, before blame; of rows near the threshold or above
+    # by row, the shares (D,) of the channels in its surprise; of rows near the threshold or above
     strong_shares: Mapping[int, Floats] = field(default_factory=dict)
     units: tuple[str, ...] = ()  # of the channels
     namer: CauseNamer | None = None  # of the causes of alarms

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table as RichTable
 
 from asm_gym.evaluation.statistics import Share
@@ -17,7 +16,7 @@ from asm_gym.evaluation.statistics import Share
 Subject = TypeVar("Subject")
 FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
 FEWEST_SHOWN = 2  # columns, however narrow a terminal is
-COLUMN_BORDER = 3  # characters beside the text of each column
+UNBOUNDED = 10_000  # width of a terminal in which no word breaks
 
 
 @dataclass(frozen=True)
@@ -38,43 +37,28 @@ class Table:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the table for a terminal, without the last columns where words would break; rich calls this."""
-        widths = self._widths(options.max_width - 1)
-        table = RichTable(title=escape(self.caption))
-        for heading, width in zip(self.headings, widths, strict=False):
-            table.add_column(escape(heading), width=width, justify="right", overflow="fold")
-        table.columns[0].justify = "left"
-        for row in self.rows:
-            table.add_row(*(escape(str(cell)) for cell in row[: len(widths)]))
+        unbounded = options.update(max_width=UNBOUNDED)
+        shown = len(self.headings)
+        table = self._first(shown)
+        while shown > FEWEST_SHOWN:
+            if Measurement.get(console, unbounded, table).minimum <= options.max_width:
+                break
+            shown -= 1
+            table = self._first(shown)
         yield table
-        left_out = self.headings[len(widths) :]
+        left_out = self.headings[shown:]
         if left_out:
             yield f"A wider terminal also shows: {escape(', '.join(left_out))}."
 
-    def _widths(self, available: int) -> list[int]:
-        """Return the widths of the columns that fit, so that each has room for its longest word."""
-        columns = [list(map(str, cells)) for cells in zip(self.headings, *self.rows, strict=True)]
-        widths = [max(map(_longest_word, cells)) for cells in columns]
-        while len(widths) > FEWEST_SHOWN and _table_width(widths) > available:
-            widths.pop()
-        for _ in range(available - _table_width(widths)):
-            more = [_extra_lines(*column) for column in zip(columns, widths, strict=False)]
-            if not any(more):
-                break
-            widths[more.index(max(more))] += 1
-        return widths
-
-
-def _longest_word(text: str) -> int:
-    return max(map(cell_len, text.split()), default=1)
-
-
-def _extra_lines(cells: Sequence[str], width: int) -> int:
-    """Return how many lines cells take beyond one each, about."""
-    return sum(max(math.ceil(cell_len(cell) / width) - 1, 0) for cell in cells)
-
-
-def _table_width(widths: Sequence[int]) -> int:
-    return sum(width + COLUMN_BORDER for width in widths)
+    def _first(self, shown: int) -> RichTable:
+        """Return the first columns as rich draws them."""
+        table = RichTable(title=escape(self.caption))
+        for heading in self.headings[:shown]:
+            table.add_column(escape(heading), justify="right", overflow="fold")
+        table.columns[0].justify = "left"
+        for row in self.rows:
+            table.add_row(*(escape(str(cell)) for cell in row[:shown]))
+        return table
 
 
 def tabulate(

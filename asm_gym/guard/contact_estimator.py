@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.memory.completion import Completion
 
-# A pressed joint's external torque is off by at least so many standard deviations of its completion.
+# A pressed joint's external torque is off by at least so many deviations of its completion.
 PRESSED = 2.5
 STILL = 0.02  # a joint that turns by no more than this does not [rad/s]
 

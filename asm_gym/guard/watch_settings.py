@@ -36,7 +36,7 @@ class WatchSettings:
     acknowledges: tuple[str, ...] = ()
     keep: Path | None = None  # file for the memory with the level shifts that were learned
     following: FollowingThreshold | None = None  # the threshold that follows
-    # Called with the time [s], the numbers (D,) and the report of each row, after its alarm is told.
+    # Called with time [s], numbers (D,) and report of each row, after its alarm is told.
     show: Callable[[float, NDArray[np.float64], RowReport], None] | None = None
 
 

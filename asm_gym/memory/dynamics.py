@@ -23,12 +23,8 @@ import numpy as np
 from asm_gym.memory.association import ChangeLayout
 from asm_gym.memory.association_learning import ALL_TICKS, learn_association
 from asm_gym.memory.learning import Schedule, Trajectory, passes, row_count
-from asm_gym.memory.recurrent import (
-    RecurrentNetwork,
-    RecurrentWeights,
-    learn_recurrent,
-    recurrent_shapes,
-)
+from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
+from asm_gym.memory.recurrent_learning import learn_recurrent
 from asm_gym.memory.settling import (
     SettlingNetwork,
     SettlingWeights,

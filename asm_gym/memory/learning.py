@@ -150,7 +150,6 @@ class Learner(ABC):
 
     learned: tuple[str, ...]  # names of the weights that are learned
     early: bool  # whether running alone is drawn for the row to come, not for the row itself
-    scalar: type[Any]  # of the precisions; numba computes in the wider type of scalars and arrays
 
     def __init__(self, weights: Any, schedule: Schedule, rng: np.random.Generator) -> None:
         self.weights = weights
@@ -166,9 +165,9 @@ class Learner(ABC):
     @property
     def inference(self) -> Inference:
         """How to infer the state by the weights as they are."""
-        pi_z = self.scalar(self.schedule.prior_precision)
-        pi_x = self.scalar(self.schedule.sensory_precision)
-        curvature = self.scalar(pi_z + pi_x * self.norm)
+        pi_z = np.float32(self.schedule.prior_precision)
+        pi_x = np.float32(self.schedule.sensory_precision)
+        curvature = np.float32(pi_z + pi_x * self.norm)
         return Inference(pi_z, pi_x, curvature, self.schedule.iterations)
 
     def learn(self, change: Any, rate: float) -> None:

@@ -180,7 +180,6 @@ class SettlingLearner(Learner):
     weights: SettlingWeights
     learned = SettlingWeights._fields
     early = True
-    scalar = np.float32
 
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, len(self.weights.W_H)), np.float32)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
 from asm_gym.data.episode import Episode
-from asm_gym.data.log_comparison import refuse_other_scales
-from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
-from asm_gym.detection.base import Arrays
+from asm_gym.detection import Blocks, EvidenceDetection
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import healthy_forces
@@ -30,41 +26,18 @@ from asm_gym.monitors.calibration import (
     require_sight,
     with_ceilings,
 )
+from asm_gym.monitors.learned_monitor import LearnedMonitor
 from asm_gym.monitors.monitor_files import read_monitor, threshold_below, write_monitor
-from asm_gym.monitors.monitor_protocol import Progress, State, Surprise
-from asm_gym.monitors.monitor_state import MonitorState, checked_rows, surprise_of_stream
+from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.robot_limits import MARGIN, RobotLimits, limits_of
-from asm_gym.monitors.stream_model import (
-    StreamModel,
-    error_shares,
-    model_outputs,
-    parameter_names,
-    require_arrays,
-    side_by_side,
-)
-from asm_gym.monitors.training_data import (
-    Hashes,
-    about_episodes,
-    check_fresh,
-    check_nominal,
-    hashes_of,
-    with_held_out,
-)
-from asm_gym.validation import check_flag, check_number, typed
+from asm_gym.monitors.training_data import check_fresh, check_nominal, hashes_of
+from asm_gym.validation import check_number, typed
 
 
-class CalibratedMonitor:
+class CalibratedMonitor(LearnedMonitor):
     """Combine a model with a detection, and set a conformal threshold from the maxima of nominal episodes.
 
-    Args:
-        model: predicts the stream.
-        detection: computes surprise from its errors.
-        seed: of all random draws while learning.
-
     Attributes:
-        about: JSON values to save with it, such as its ``name``.
-        learned_from_: hashes of the episodes of ``fit``; None before.
-        ceilings_from_: hashes of the episodes of ``calibrate`` that set ceilings; None before, or without such.
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
         blocks_: surprise in blocks of time, for promises by the hour (``detection.conformal``).
@@ -76,12 +49,9 @@ class CalibratedMonitor:
         commands_: (3, A) least, most and greatest step of the commands of these episodes; None without.
         ranges_: (8, D) how far each number went in these episodes (``detection.healthy_ranges``); None in files of
             earlier versions.
-        readings_: (3, X) least, most and greatest step of each sense in the episodes of ``fit`` and ``calibrate``; None
-            where no reading is judged by it (``detection.misreadings``).
         wear_: (4, M) how much senses drift between these episodes (``detection.drift``); None without.
     """
 
-    model: StreamModel
     threshold_: float | None
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
@@ -90,19 +60,7 @@ class CalibratedMonitor:
     motion_: NDArray[np.floating[Any]] | None
     commands_: NDArray[np.floating[Any]] | None
     ranges_: NDArray[np.floating[Any]] | None
-    readings_: NDArray[np.floating[Any]] | None
     wear_: NDArray[np.floating[Any]] | None
-
-    def __init__(self, model: StreamModel, detection: Detection, seed: int = 0) -> None:
-        self.seed = check_number("seed", seed, low=0, whole=True)
-        self.spec = model.spec
-        self.model = model
-        self.detection = detection
-        self._uncalibrate()
-        self.readings_ = None
-        self.learned_from_: Hashes | None = None
-        self.ceilings_from_: Hashes | None = None
-        self.about: dict[str, Any] = {}
 
     def __repr__(self) -> str:
         """Return name, body and threshold in one line."""
@@ -115,104 +73,12 @@ class CalibratedMonitor:
             parts.append(f"threshold {self.threshold_:.4g}")
         return f"<{type(self).__name__} {', '.join(parts)}>"
 
-    @property
-    def learned_(self) -> dict[str, NDArray[Any]]:
-        """All arrays that ``fit`` has learned, by name; empty before."""
-        return {**self.model.learned_, **self.detection.learned_}
-
-    @property
-    def skills_(self) -> tuple[str, ...]:
-        """Names of the skills it knows."""
-        return self.model.skills_
-
-    def get_params(self) -> dict[str, Any]:
-        """Return the hyperparameters by name."""
-        params: dict[str, Any] = {}
-        for part in (self.model, self.detection):
-            names = parameter_names(type(part))
-            params |= {name: getattr(part, name) for name in names if name != "seed"}
-        return params | {"seed": self.seed}
-
     @typed
     def with_threshold(self, value: float) -> Self:
         """Return a copy with another threshold, ``inf`` for no alarm."""
         other = self._copy()
         other.threshold_ = check_number("threshold", value, infinite=True)
         return other
-
-    @typed
-    def fit(
-        self,
-        episodes: Sequence[Episode],
-        progress: Progress | None = None,
-        *,
-        warm_start: bool = False,
-    ) -> Self:
-        """Learn from nominal episodes of any number of skills, without labels, and return the monitor.
-
-        Args:
-            episodes: nominal episodes with this spec.
-            progress: called as ``progress(done, total)`` while learning.
-            warm_start: continue from the fitted model, for a model that can: 10 to 50 episodes are then enough. The
-                detection does not change.
-
-        Raises:
-            ValueError: no episode, one that is too short or has another spec, or a number that is not finite.
-            TypeError, RuntimeError: with ``warm_start``, the model has no warm start, or is not fitted yet.
-        """
-        if check_flag("warm_start", warm_start):
-            if not hasattr(self.model, "specialise"):
-                raise TypeError(f"{self._name} has no warm start: leave warm_start out")
-            self._require_fitted()
-        check_nominal(episodes, self.spec, self.model.shortest)
-        refuse_other_scales(episodes)
-        new = self._copy()  # an interrupt leaves this one as it was
-        new._learn(episodes, progress or (lambda done, total: None), warm_start)
-        about = about_episodes(episodes, with_actions=not warm_start)
-        if warm_start:
-            about = {**self.about, "specialised_on": len(episodes), **about}
-        new.about = about
-        self._become(new)
-        return self
-
-    def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
-        """Learn from episodes, in place: anew, or on from what is learned with ``warm_start``."""
-        self._uncalibrate()
-        hashes = hashes_of(episodes)
-        if warm_start and self.learned_from_ is not None:
-            hashes = np.union1d(self.learned_from_, hashes)
-        self.learned_from_ = hashes
-
-        with threadpool_limits(1):  # products this small are slower on several threads
-            if warm_start:
-                model: Any = self.model
-                model.specialise(episodes)
-                self._place_errors()
-                return
-            self.ceilings_from_ = None
-            self._learn_anew(episodes, progress)
-
-    def _learn_anew(self, episodes: Sequence[Episode], progress: Progress) -> None:
-        """Fit the model, and then the detection on the model's errors."""
-        rng = np.random.default_rng(self.seed)
-        learned, held_out = with_held_out(episodes, self.model.held_out, rng)
-        self.model.fit(learned, rng, progress)
-        self._place_errors()
-        nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
-        shared_names = self.model.learned_.keys() & set(self.detection.arrays)
-        if shared_names:
-            names = ", ".join(sorted(shared_names))
-            raise ValueError(f"{self.model.kind} and {self.detection.name} both learn {names}")
-        self.detection.fit(nominal, rng)
-        self.model.crossfitted = {}
-
-    def _nominal_outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
-        """Return the model's outputs, with the cross-fitted errors of the episodes that it has learned."""
-        outputs = []
-        for episode, output in zip(episodes, model_outputs(self.model, episodes), strict=True):
-            errors = self.model.crossfitted.get(id(episode), output.errors)
-            outputs.append(output._replace(errors=errors))
-        return outputs
 
     @typed
     def calibrate(
@@ -272,10 +138,6 @@ class CalibratedMonitor:
         new._keep_healthy_ranges(episodes)
         self._become(new)
         return self
-
-    def _become(self, new: Self) -> None:
-        """Take over everything from a copy that has learned or was calibrated."""
-        vars(self).update(vars(new))
 
     def _set_ceilings(self, episodes: Sequence[Episode]) -> None:
         """Set the ceilings of the detection by healthy episodes."""
@@ -353,65 +215,6 @@ class CalibratedMonitor:
         return self.score_episodes(episodes)
 
     @typed
-    def initial_state(self, batch: int = 1) -> MonitorState:
-        """Return the state before the first row of ``batch`` streams."""
-        check_number("batch", batch, low=1, whole=True)
-        self._require_fitted()
-        return MonitorState(
-            self.model.start(batch), self.detection.start(batch, len(self.model.error_columns))
-        )
-
-    def observe(
-        self, state: MonitorState, stream: NDArray[np.floating[Any]]
-    ) -> tuple[MonitorState, Surprise]:
-        """Return the new state after the next row (B, D) of each stream, and the surprise of the rows.
-
-        A number that is not finite makes the surprise and its own attribution infinite, and counts as missing
-        afterwards. The old state does not change.
-        """
-        self._require_fitted()
-        rows = checked_rows(state, stream, self.spec)
-        model, output = self.model.predict(state.model, rows)
-        detection, surprise = self.judge(state.detection, output, rows)
-        return MonitorState(model, detection), surprise
-
-    def judge(
-        self, state: State, output: ModelOutput, rows: NDArray[Any]
-    ) -> tuple[State, Surprise]:
-        """Return the new state of the detection, and the surprise of rows (B, D) by the model's output for them."""
-        state, attribution = self.detection.attribute_step(
-            state, output, rows, lambda shares: shares @ self._error_shares
-        )
-        is_finite = np.isfinite(rows)
-        incomplete = ~is_finite.all(axis=1)
-        attribution[incomplete] = np.where(is_finite[incomplete], 0.0, np.inf)
-        return state, Surprise(attribution.sum(axis=1), attribution)
-
-    @typed
-    def reset_evidence(self, state: MonitorState) -> MonitorState:
-        """Return the state without its evidence, after the response to an alarm; the state of the model stays."""
-        return state._replace(detection=self.detection.reset(state.detection))
-
-    @typed
-    def score(self, episode: Episode) -> Surprise:
-        """Return the surprise of each step of an episode: values (T,), attributions (T, D)."""
-        return self.score_episodes([episode])[0]
-
-    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
-        """Return the ``score`` of each episode; they run in one batch."""
-        for episode in episodes:
-            self.spec.require(episode.spec, "the episode")
-        self._require_fitted()
-        scores = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
-        with threadpool_limits(1):
-            for group, steps in side_by_side(episodes, self.initial_state, self.observe):
-                for stream, index in enumerate(group):
-                    own_steps = steps[: len(episodes[index])]
-                    if own_steps:
-                        scores[index] = surprise_of_stream(own_steps, stream)
-        return scores
-
-    @typed
     def save(self, path: str | Path) -> None:
         """Write all that was learned to one file of arrays and JSON, which ``load`` reads."""
         self._require_fitted()
@@ -430,17 +233,6 @@ class CalibratedMonitor:
         self.threshold_ = threshold_below(header["threshold"], self.detection.reach)
         return self
 
-    def restore_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        """Take over the arrays that ``learned_`` returned, in place and without a threshold; return the monitor."""
-        require_arrays(arrays, self.detection.arrays)
-        self._uncalibrate()
-        arrays_of_model = dict(arrays)
-        own_arrays = {name: arrays_of_model.pop(name) for name in self.detection.arrays}
-        self.detection.restore(own_arrays)
-        self.model.restore(arrays_of_model, skills)
-        self._place_errors()
-        return self
-
     def _uncalibrate(self) -> None:
         """Forget all that ``calibrate`` has set, but for ceilings."""
         self.threshold_ = None
@@ -454,28 +246,7 @@ class CalibratedMonitor:
         self.ranges_ = None
         self.wear_ = None
 
-    @property
-    def _name(self) -> str:
-        return f"{self.model.kind} monitor"
-
     def _lacking(self, what: str) -> NotFitted:
         """Return the error of a monitor that is not calibrated. Raises that of one that is not even fitted."""
         self._require_fitted()
         return NotFitted(f"this {self._name}", f"has no {what}", "calibrate(nominal_episodes)")
-
-    def _copy(self) -> Self:
-        """Return a copy that shares nothing that learning changes; learned arrays are never changed in place."""
-        other = copy.copy(self)
-        other.about = copy.deepcopy(self.about)
-        other.model = copy.copy(self.model)
-        other.detection = copy.copy(self.detection)
-        return other
-
-    def _require_fitted(self) -> None:
-        """Raise NotFitted before ``fit``."""
-        if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
-            raise NotFitted(f"this {self._name}", "has learned nothing", "fit(episodes)")
-
-    def _place_errors(self) -> None:
-        """Compute how each error is shared out to columns, once the model knows which it predicts."""
-        self._error_shares = error_shares(self.model.error_columns, self.spec)

@@ -45,7 +45,8 @@ class Expected(NamedTuple):
 
     def __str__(self) -> str:
         """Return it for a table."""
-        return f"{self.sensed:.4g}, expected {self.expected:.4g} ± {self.plus_minus:.2g} {self.unit}".rstrip()
+        expected = f"{self.expected:.4g} ± {self.plus_minus:.2g}"
+        return f"{self.sensed:.4g}, expected {expected} {self.unit}".rstrip()
 
     def sentence(self, channel: str) -> str:
         """Return what the channel read and what was expected, as a sentence without a full stop."""

@@ -78,14 +78,10 @@ RIVALS = {
     "kalman": _rival("baselines.kalman:Kalman", "mahalanobis"),
     "association_linear": _rival("baselines.change_regression:LinearAssociation", "mahalanobis"),
     "association_values": _rival("torque.value_association:ValueAssociation", "largest"),
-    "external_torque_limit": _rival("baselines.fixed_limits:ExternalTorqueLimit", "largest"),
-    "force_limit": _rival("baselines.fixed_limits:ForceLimit", "squares"),
 }
 
 BY_EVIDENCE = {
-    name + EVIDENCE: replace(kind, detection="evidence")
-    for name, kind in RIVALS.items()
-    if "limit" not in name
+    name + EVIDENCE: replace(kind, detection="evidence") for name, kind in RIVALS.items()
 }
 
 MONITORS: Registry[MonitorKind] = Registry(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.monitors.torque.arm_features import position_columns
+from asm_gym.readings import spans
 from asm_gym.scaling import StreamScaler, rows_apart
 
 Floats = NDArray[np.float64]
@@ -58,7 +59,7 @@ class PaceMemory(NamedTuple):
         slowest = STILL * float(np.median(speed))
         if slowest <= 0.0:
             return None
-        pauses = [longest_run(motion.speed < slowest) for motion in motions]
+        pauses = [_longest_run(motion.speed < slowest) for motion in motions]
         moving = np.flatnonzero(speed >= slowest)
         kept = moving[:: max(1, len(moving) // MOST_MOMENTS)]
         place = np.concatenate([motion.place for motion in motions])
@@ -159,7 +160,6 @@ def _distance_of_others(places: Floats, episode: NDArray[np.intp]) -> float:
     return float(np.quantile(nearest, FARTHEST))
 
 
-def longest_run(mask: NDArray[np.bool_]) -> int:
+def _longest_run(mask: NDArray[np.bool_]) -> int:
     """Return the length of the longest run of True in a mask (T,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
-    return int(np.max(edges[1::2] - edges[::2], initial=0))
+    return max((stop - start for start, stop in spans(mask)), default=0)

@@ -43,7 +43,9 @@ KINDS = {
     HAND_SPEED: r"(hand|tcp|ee)\w*(vel|speed)",
     CURRENT: r"current",
     JOINT_SPEED: r"joint\w*[_ .]?(vel|speed)|^(qd|dq|qvel|velocity|velocities|vel)$|\.vel$",
-    POSITION: r"joint\w*[_ .]?(pos|angle)|^(q|qpos|position|positions|pos)$|\.pos$|observation\.state",
+    POSITION: (
+        r"joint\w*[_ .]?(pos|angle)|^(q|qpos|position|positions|pos)$|\.pos$|observation\.state"
+    ),
 }
 """What a channel senses, by its name; the first that fits counts."""
 

@@ -8,7 +8,6 @@ stops at the errors, for a memory under another detection and for one that learn
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.blas import one_thread_for
-from asm_gym.compilation import Bound, bind, compiled, inner, must_compile
+from asm_gym.compilation import Bound, announce, bind, compiled, inner
 from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.detection.base import ModelOutput
 from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState, find_events
@@ -103,10 +102,7 @@ class RowKernel:
     def __init__(
         self, memory: RowWeights, detection: EvidenceDetection, events: BenignEvents | None
     ) -> None:
-        if must_compile(observe_rows):
-            print(
-                "asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr
-            )
+        announce(observe_rows, "the memory")
         self._arguments = (memory, detection, events)
         self._memory = memory
         self._detector = detection.fitted_detector

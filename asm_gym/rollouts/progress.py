@@ -1,4 +1,4 @@
-"""Progress of a stage: a bar in a terminal, elsewhere a line every ten seconds."""
+"""Progress of a stage on standard error: a bar in a terminal, elsewhere a line every ten seconds."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ EVERY_S = 10.0  # least time between two lines [s]
 
 @contextmanager
 def stage(
-    name: str, console: Console, seconds: dict[str, float] | None = None
+    name: str, seconds: dict[str, float] | None = None, console: Console | None = None
 ) -> Iterator[Progress]:
     """Show the progress of a stage while the block runs, which reports it by a function of (done, total).
 
     Args:
         name: of the stage.
-        console: to print to.
         seconds: gets the duration of the stage by its name [s].
+        console: to print to; standard error by default.
     """
+    console = console or Console(stderr=True)
     start = time.perf_counter()
     last_print = start
     reached = ""
@@ -56,7 +57,9 @@ def stage(
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
+    disable = not console.is_terminal
+    # Standard output may be a pipe.
+    with Bars(*columns, console=console, disable=disable, redirect_stdout=False) as bars:
         bar = bars.add_task(name, total=None)
         yield report
         total = bars.tasks[bar].total or 1

@@ -129,7 +129,7 @@ def train(
         TypeError: spaces other than Boxes with one axis.
         ValueError: demonstrations of other sizes.
     """
-    # Evaluations have an environment of their own, as they would reset the learner's amid an episode.
+    # Evaluations would reset the learner's environment amid an episode: they have their own.
     with closing(make_env()) as env, closing(make_env()) as evaluation_env:
         check_sizes(env, demonstrations)
         observations = np.concatenate([e.observations for e in demonstrations])

@@ -146,18 +146,18 @@ class Args(Options):
         return cases
 
 
-def record_motions(args: Args, console: Console) -> list[Episode]:
+def record_motions(args: Args) -> list[Episode]:
     """Record the training motions that are missing, and return all."""
     motions = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     make = partial(record_motion, config=args.config, folder=args.out.resolve())
-    with stage("babbling", console) as progress:
+    with stage("babbling") as progress:
         files = make_missing(
             make, motions, lambda motion: args.out / motion.path, args.workers, progress
         )
     return [load_episode(file) for file in sorted(files)]  # in whichever order tasks were named
 
 
-def record_hours(args: Args, console: Console) -> list[Episode]:
+def record_hours(args: Args) -> list[Episode]:
     """Record the healthy hours of the experts that are missing, and return all in which they succeed.
 
     But for those with a missing number, such as the pose of an object that is out of sight: that is an alarm at
@@ -167,7 +167,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     for task in args.shown:
         seeds = role_seeds(HOURS_SEED, task, "hours", args.healthy(task))
         trials += nominal_trials(task_spec(task).id, "nominal", seeds)
-    with stage("healthy hours", console) as progress:
+    with stage("healthy hours") as progress:
         files = record_missing(trials, args.config, args.out / "hours", args.workers, progress)
     hours = [load_episode(file) for file in files]
     if args.corpus is not None:
@@ -177,12 +177,12 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     return [e for e in hours if e.success and np.isfinite(e.stream).all()]
 
 
-def pretrain(args: Args, console: Console) -> NeuralASM:
+def pretrain(args: Args) -> NeuralASM:
     """Record what is missing of training motions and healthy hours; fit, calibrate and save the memory."""
-    motions = healthy(record_motions(args, console))
-    hours = record_hours(args, console)
+    motions = healthy(record_motions(args))
+    hours = record_hours(args)
     arm: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
-    with stage("learning", console) as progress:
+    with stage("learning") as progress:
         memory = learn_body(motions, arm.stream_spec, args.seed, progress)
     calibrate_body(memory, motions, hours, args.false_alarms_per_hour)
     name = args.robot.lower()
@@ -205,7 +205,7 @@ def pretrain(args: Args, console: Console) -> NeuralASM:
     return memory
 
 
-def evaluate(args: Args, memory: NeuralASM, console: Console) -> list[Scores]:
+def evaluate(args: Args, memory: NeuralASM) -> list[Scores]:
     """Record the missing episodes of each case, and score them; faults happen where a policy or a task is unknown."""
     scores = []
     usual: dict[str, float] = {}  # force in each task, by its expert, who comes first
@@ -217,7 +217,7 @@ def evaluate(args: Args, memory: NeuralASM, console: Console) -> list[Scores]:
             kinds = [kind for kind in kinds_of((TEST,)) if possible(kind, arm)]
         trials = case.trials(args.exam_episodes, kinds, args.seed)
         folder = args.out / "exams" / case.policy
-        with stage(case.name, console) as progress:
+        with stage(case.name) as progress:
             files = record_missing(trials, config, folder, args.workers, progress)
             recordings = [load_episode(file) for file in files]
             force = usual.setdefault(case.task, usual_force(recordings))
@@ -229,9 +229,9 @@ def babble(args: Args, console: Console) -> None:
     """Record, learn, evaluate, and print the results."""
     claim = {n: getattr(args, n) for n in ("robot", "stream_freq", "seed", "reaching")}
     with claimed(args.out, "babble.json", claim):
-        memory = pretrain(args, console)
+        memory = pretrain(args)
         if args.exam_episodes:
-            publish(args, memory, evaluate(args, memory, console), console)
+            publish(args, memory, evaluate(args, memory), console)
     console.print(
         f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, "
         "NeuralASM.load(...)) watches with it"

@@ -27,13 +27,9 @@ COMMANDS = {
     "corpus": "record the episodes behind the detection tables",
     "reproduce": "run the studies behind the method's claims",
     "benchmark": "measure speeds as ratios against named rivals",
-    "completion": "print what lets bash or zsh complete commands and options",
 }
 
-MODULES = {
-    "inspect": "inspect_log",
-    "completion": "shell_completion",
-}  # modules with another name than their command
+MODULES = {"inspect": "inspect_log"}  # modules with another name than their command
 
 
 def usage(prog: str, lines: dict[str, str], *notes: str) -> str:

@@ -64,7 +64,7 @@ def collect(args: Args, console: Console) -> None:
         console.print(f"Note: {unknown}.", soft_wrap=True, markup=False)
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
-        with stage("recording", console) as progress:
+        with stage("recording") as progress:
             folder = args.out / "episodes"
             seeds = episode_seeds(args.seed, args.episodes)
             files = collect_to(folder, task, config, seeds, args.workers, progress)

@@ -50,7 +50,7 @@ def make(args: Args, console: Console) -> None:
     with claimed(args.out, CLAIM, {"corpus": VERSION, "quick": args.quick}):
         for part in args.part:
             for number in range(min(args.rounds, total)):
-                with stage(f"{part}, round {number + 1}", console) as progress:
+                with stage(f"{part}, round {number + 1}") as progress:
                     record_corpus(args.out, sources[part], number, total, args.workers, progress)
     files = Corpus.open(args.out).files
     healthy = (files.role != "faulty").sum()

@@ -107,14 +107,14 @@ def trials(args: Args) -> list[Trial]:
     ]
 
 
-def fit(args: Args, console: Console) -> tuple[Path, Share]:
+def fit(args: Args) -> tuple[Path, Share]:
     """Fit, calibrate and save a memory of the task; return its file and how often the expert succeeded."""
     env = env_id(args.task)
     count = args.fit_episodes + args.calibration_episodes
-    with stage("collecting nominal episodes", console) as progress:
+    with stage("collecting nominal episodes") as progress:
         episodes = collect(env, "scripted", count, args.seed, args.workers, progress=progress)
     memory = NeuralASM(episodes[0].spec, epochs=args.epochs, seed=args.seed)
-    with stage("learning", console) as progress:
+    with stage("learning") as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
     memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=FALSE_ALARM_RATE)
     file = args.out / f"{task_in(env).lower()}.asm"
@@ -132,9 +132,9 @@ def episode_to_show(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
 def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
-    memory, expert = fit(args, console)
+    memory, expert = fit(args)
     work = partial(watch_pair, config=RolloutConfig(), memory=memory)
-    with stage("testing, policy alone and wrapped", console) as progress:
+    with stage("testing, policy alone and wrapped") as progress:
         pairs = parallel_map(work, trials(args), args.workers, progress)
     traces = [trace for pair in pairs for trace in pair]
     rows = by_condition(traces, WINDOW_S)

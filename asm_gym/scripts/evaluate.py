@@ -8,12 +8,10 @@ from __future__ import annotations
 import json
 import math
 import platform
-from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-import gymnasium as gym
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
@@ -23,7 +21,6 @@ from asm_gym.evaluation.report_page import publish
 from asm_gym.evaluation.scoring import benchmark
 from asm_gym.faults import foreign_faults
 from asm_gym.faults.suite import SEVERITIES, kinds_of
-from asm_gym.monitors import make_monitor
 from asm_gym.monitors.monitor_registry import BY_EVIDENCE, check_monitor_name
 from asm_gym.rollouts.detection_corpus import SKILLS, VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map
@@ -31,8 +28,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.run_trials import record_missing
 from asm_gym.rollouts.trial import RolloutConfig, Trial, evaluation_trials
-from asm_gym.scripts.command import Options, one_line, option, origin, run
-from asm_gym.stream_source import StreamSource
+from asm_gym.scripts.command import Options, option, origin, run
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 from asm_gym.validation import check_choice, check_number
 
@@ -43,8 +39,6 @@ _QUICK = (
     "association_linear+evidence",
     "kalman+evidence",
     "logpzo",
-    "external_torque_limit",
-    "force_limit",
 )
 """Monitors that are fitted in seconds."""
 
@@ -69,7 +63,7 @@ class Args(Options):
         ("neural_asm", *BY_EVIDENCE), quick=_QUICK, least=1, check=check_monitor_name
     )
     """Names of monitors. Without +evidence a rival is judged as its authors do; MODEL+DETECTION combines any two, as in
-    external_torque_limit+evidence."""
+    kalman+squares."""
     faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all; development or test for one half of the suite."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
@@ -145,26 +139,6 @@ class Args(Options):
         return RolloutConfig(self.policy)
 
 
-def without_unfit_monitors(args: Args, console: Console) -> Args:
-    """Leave out the monitors that cannot watch the environment, and say which. Raises ValueError for all of them."""
-    if not args.elsewhere:
-        return args
-    with closing(gym.make(env_id(args.tasks[0]), **dict(args.config.settings))) as env:
-        spec = StreamSource(env).spec
-    fit = []
-    reasons = []
-    for name in args.monitors:
-        try:
-            make_monitor(name, spec)
-            fit.append(name)
-        except ValueError as error:
-            reasons.append(one_line(error))
-            console.print(f"{name} is left out: {reasons[-1]}", highlight=False)
-    if not fit:
-        raise ValueError(f"no monitor can watch this: {reasons[0]}")
-    return replace(args, monitors=tuple(fit))
-
-
 def trials_of(args: Args, task: str) -> list[Trial]:
     """Return every trial of a task."""
     return evaluation_trials(
@@ -180,9 +154,7 @@ def trials_of(args: Args, task: str) -> list[Trial]:
 
 def evaluate(args: Args, console: Console) -> None:
     """Record, fit, judge and publish; print the tables in brief."""
-    args = without_unfit_monitors(args, console)
     seconds: dict[str, float] = {}  # of each stage
-    timed = partial(stage, console=console, seconds=seconds)
     claim = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     trials = []
     if args.corpus is not None:
@@ -193,9 +165,9 @@ def evaluate(args: Args, console: Console) -> None:
         files = [args.out / trial.label.path for trial in trials]
     with claimed(args.out, "recordings.json", claim):
         if trials:
-            with timed("recording") as progress:
+            with stage("recording", seconds) as progress:
                 record_missing(trials, args.config, args.out, args.workers, progress)
-        with timed("fitting and judging") as progress:
+        with stage("fitting and judging", seconds) as progress:
             result = benchmark(
                 args.out,
                 files,
@@ -205,7 +177,7 @@ def evaluate(args: Args, console: Console) -> None:
                 seed=args.seed,
                 map_items=partial(parallel_map, workers=args.workers, progress=progress),
             )
-        with timed("drawing"):
+        with stage("drawing", seconds):
             details = origin() | json.loads(json.dumps(asdict(args), default=str))
             machine = {"python": platform.python_version(), "machine": platform.machine()}
             publish(args.out, result, details | machine | {"seconds": seconds})
@@ -214,7 +186,7 @@ def evaluate(args: Args, console: Console) -> None:
         tables.append(kinds_table(result))
     for table in tables:
         console.print(table)
-    console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
+    console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.md'}")
 
 
 main = partial(run, "evaluate", Args, evaluate)

@@ -310,10 +310,10 @@ def hours_of(episodes: list[Episode]) -> float:
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
-def read_normal(args: Args, console: Console) -> tuple[list[Episode], str]:
+def read_normal(args: Args) -> tuple[list[Episode], str]:
     """Return the normal episodes, and which others were left out; ValueError where there is none."""
     logs = read_logs(args.data, args.hints(args.action), args.given_schema())
-    with stage("reading", console) as progress:
+    with stage("reading") as progress:
         episodes, counts = normal_episodes(logs, args.split is not None, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in counts.items())
     if episodes:
@@ -336,7 +336,7 @@ def fit(args: Args, console: Console) -> int:
     start = time.perf_counter()
 
     with noted() as notes:
-        episodes, left_out = read_normal(args, console)
+        episodes, left_out = read_normal(args)
     parts, notes_on_parts = parts_between_gaps(args, episodes)
     stretches = [[part] for part in parts]
     if args.split is not None:
@@ -348,7 +348,7 @@ def fit(args: Args, console: Console) -> int:
     args = args.promising(len(calibration))
 
     spec = fitting[0].spec
-    with stage("learning", console) as progress:
+    with stage("learning") as progress:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)

@@ -92,6 +92,8 @@ def inspect(args: Args, console: Console) -> int:
             if number == 0 and args.schema is not None:
                 write_schema(args.schema, recording.schema)
                 say(f"Wrote {args.schema}. Next: asm-gym fit {args.log} --schema {args.schema}")
+            if number == DRAWN_LOGS:
+                say(f"Only the first {DRAWN_LOGS} logs are drawn.")
     for note in notes:
         say(f"Note: {note}.")
     return exit_code_of_reading(notes, exit_code)

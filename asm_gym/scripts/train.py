@@ -77,7 +77,7 @@ def train_agent(args: Args, console: Console) -> None:
         if args.dataset is None:
             folder = args.out / "demonstrations" / "episodes"
             seeds = episode_seeds(args.seed, args.demonstrations)
-            with stage("recording demonstrations", console) as progress:
+            with stage("recording demonstrations") as progress:
                 files = collect_to(folder, task, config, seeds, args.workers, progress)
             episodes = [load_episode(file) for file in files]
         solved = [episode for episode in episodes if episode.success]
@@ -91,9 +91,9 @@ def train_agent(args: Args, console: Console) -> None:
             evaluation_episodes=args.evaluation_episodes,
             seed=args.seed,
         )
-        with stage("cloning and learning", console) as progress:
+        with stage("cloning and learning") as progress:
             agent = train(make, args.out, solved, settings, progress)
-        with stage("judging", console), closing(make()) as env:
+        with stage("judging"), closing(make()) as env:
             policy = agent.fit_to(env, "the agent")
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
             success = float(np.mean([rollout(env, policy, seed) for seed in seeds]))

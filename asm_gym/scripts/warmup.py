@@ -41,7 +41,7 @@ def warm_up(args: Args, console: Console) -> None:
     start = time.perf_counter()
     with semaphores_needed():
         executor = ProcessPoolExecutor(2, get_context("spawn"))
-    with stage("compiling", console) as progress, executor as processes:
+    with stage("compiling") as progress, executor as processes:
         parts = [processes.submit(_compile_memory), processes.submit(_compile_simulation)]
         for done, part in enumerate(as_completed(parts), 1):
             part.result()

@@ -114,10 +114,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
         reviewed.wear = monitor.wear_counter()
     bridge = bridge_of(args.bridge, monitor.spec.dt)
     writable(args.out / "alarms.csv")
-    progress_console = console
-    if args.json:
-        progress_console = Console(stderr=True)
-    with stage("watching", progress_console) as progress, noted() as notes:
+    with stage("watching") as progress, noted() as notes:
         logs = iter(read_logs(args.source, args.hints(), schema_of(args, monitor)))
         while group := list(islice(logs, AT_ONCE)):  # a folder may be larger than memory
             reviewed.add(group, monitor, bridge, args.out / INCIDENTS)

@@ -19,13 +19,13 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.linear_association import check_inputs
-from asm_gym.monitors.baselines.fixed_limits import LEAST_CHANNEL_SPREAD
 from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
 LEAST_VARIANCE = 1e-4  # of w and v, standardised
+LEAST_CHANNEL_SPREAD = 1e-6  # of a channel [its unit]
 
 
 Floats = NDArray[np.float64]

@@ -157,7 +157,7 @@ class Expert(StatefulPolicy):
         self.size = int(np.prod(env.action_space.shape or ()))
         # indices of the action that move arms
         self.arm_columns = np.setdiff1d(np.arange(self.size), inner.gripper_actions)
-        # Plans are made for the pace and reach of a Panda; other arms drift further from their course.
+        # Plans are made for the pace and reach of a Panda; other arms drift further.
         self.is_careful = set(inner.robots) != {"Panda"}
         self.gain = 3.0 if self.is_careful else 2.0
 

@@ -104,7 +104,7 @@ class PickPlaceExpert(CarryExpert):
         if self.is_careful and name == "Can":
             axes += DIAGONALS
         along = max(axes, key=lambda axis: _way_to_wall(thing.orientation @ axis, to_walls))
-        # The palm stays above the walls; that of another arm than a Panda is not compared with them.
+        # The palm stays above the walls; only a Panda's is compared with them.
         return Closing(along, room=ENOUGH_ROOM)
 
     def _headings(self, place: Vector, closing: Vector) -> tuple[float, ...]:

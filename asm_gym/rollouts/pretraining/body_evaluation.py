@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import cycle, product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,17 +61,6 @@ class EvaluationCase(NamedTuple):
         return trials
 
 
-class MovingThreshold(Protocol):
-    """A threshold that each episode moves."""
-
-    @property
-    def value(self) -> float:
-        """Its present value."""
-
-    def follow(self, largest: float) -> None:
-        """Move after an episode of this greatest surprise."""
-
-
 class Scores(NamedTuple):
     """The result of one case."""
 
@@ -90,16 +79,15 @@ class Scores(NamedTuple):
         return Scores(self.name, solved, failed, metrics)
 
     def adapted(self, per_hour: float) -> Scores:
-        """Return the result under an adaptive threshold that aims for so many alarms per hour."""
+        """Return the result under an adaptive threshold that aims for so many alarms per hour.
+
+        Healthy episodes move it; faults are judged by its last value.
+        """
         if not self.solved:
             return self
         hours_of_episode = hourly_alarms(self.solved).hours / len(self.solved)
         share_in_alarm = min(per_hour * hours_of_episode, MOST_IN_ALARM)
-        adaptive = AdaptiveThreshold(share_in_alarm)
-        return self.under(adaptive.start(self.solved[0].threshold))
-
-    def under(self, running: MovingThreshold) -> Scores:
-        """Return the result under a threshold that healthy episodes move; faults are judged by its last value."""
+        running = AdaptiveThreshold(share_in_alarm).start(self.solved[0].threshold)
         solved = []
         for trace in self.solved:
             solved.append(trace.at(running.value))

@@ -1,4 +1,4 @@
-"""``asm-gym reproduce <study>``: the claims of the method, each as one study with a figure, tables and every number."""
+"""``asm-gym reproduce <study>``: the claims of the method, each as one study with tables and every number."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STUDIES = {
     "learning": "agents that learn from scratch: harm and reward, alone and under guards",
     "chunks": "impacts predicted from chunks of actions, and false predictions",
     "day": "a simulated day of an arm: incidents against ten events",
-    "alarm_causes": "the channel that an alarm points to, and its cause in words, on a simulated arm",
+    "alarm_causes": "the channel that an alarm points to, and its cause in words",
     "hours": "false alarms an hour of a shipped memory; needs a corpus",
     "wear": "how soon drifting encoders and growing friction are told as wear",
     "real_arms": "faults added to recordings of real arms (to download)",

@@ -94,9 +94,7 @@ class Config(kit.Config):
     """
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
-    guards: tuple[str, ...] = option(
-        (POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME"
-    )
+    guards: tuple[str, ...] = option((POLICY_ALONE, "default"), known=GUARDS, metavar="NAME")
     """Ways to guard."""
     tasks: tuple[str, ...] = option(ALL_TASKS, quick=("Lift",), known=ALL_TASKS, metavar="TASK")
     """Tasks; hostile policies act in the first five, and in the last two where these are against unmet ones."""
@@ -216,21 +214,31 @@ def run(config: Config) -> kit.Findings:
     if len(hostile) and len(healthy) and POLICY_ALONE in guards:
         usual = frame[(frame.robot == "Panda") & (frame.rate == CONTROL_RATE)]
         drawn = frontier(usual, config.guards)
-    return kit.Findings(records, [table for table in tables if table.rows], drawn)
+    return kit.Findings(records, without_repeats(tables), drawn)
 
 
 # ------------------------------------------------------------------ tables
 
 
+def without_repeats(tables: Sequence[Table]) -> list[Table]:
+    """Return the tables that have rows, and others than those before: of one task, policies are cells."""
+    kept: list[Table] = []
+    for table in tables:
+        if table.rows and not any(table.rows == other.rows for other in kept):
+            kept.append(table)
+    return kept
+
+
 def by_guard(
     caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]
 ) -> Table:
-    """Return a row for each guard in each group of episodes with the same values of some columns."""
-    rows = []
+    """Return a row for each guard in each group of episodes with the same values of some columns, each once."""
+    rows: list[dict[str, str]] = []
     for columns in groups:
         for _, own in frame.groupby(list(columns), sort=False):
             present = [guard for guard in guards if (own.guard == guard).any()]
-            rows += [guard_row(own, guard) for guard in present]
+            new = [guard_row(own, guard) for guard in present]
+            rows += [row for row in new if row not in rows]
     return kit.table_of(caption, rows)
 
 

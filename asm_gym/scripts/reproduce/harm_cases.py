@@ -23,8 +23,6 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.1, 0.15, 0.25)},
     "no speed limit": {"contact_limits": ContactLimits(hand_speed=np.inf)},
     "no limits": {"contact_limits": None},
-    "hold": {"on_alarm": "hold"},
-    "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
 RAMMED_TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")

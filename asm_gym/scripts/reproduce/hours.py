@@ -2,14 +2,7 @@
 
 Only episodes that solved the task count as healthy. Surprise that a knock or a stop explains is counted apart.
 
-Three alarms are compared: the hourly threshold, one that follows each policy, and an e-detector, which bounds the mean
-time between false alarms at whatever time one looks, and lets weak evidence add up from episode to episode:
-
-    M_k = (M_{k-1} + 1) e(p_k)     alarm at M_k >= c; then M_k = 0      e(p) = (1 - p + p ln p) / (p ln² p)
-
-p_k is the rank of the greatest surprise of episode k among n blocks of calibration, and c the number of blocks between
-the false alarms that are promised. Sources: Shin, Ramdas and Rinaldo 2024 (NEJSDS 2(2), arXiv 2203.03532) for the
-detector of Shiryaev and Roberts' form; Vovk and Wang 2021 (Annals of Statistics 49(3)) for e(p).
+The hourly threshold is compared with one that follows each policy.
 """
 
 from __future__ import annotations
@@ -18,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-
-import numpy as np
 
 from asm_gym.detection.conformal import HOUR, Blocks
 from asm_gym.evaluation.defaults import WINDOW_S
@@ -90,7 +81,7 @@ def run(config: Config) -> Findings:
     tables = [
         promises_table(new, thresholds),
         scores_table(new, memory),
-        rules_table(new, memory, thresholds),
+        rules_table(new, thresholds),
         splits_table(new + known),
     ]
     return Findings(records, tables)
@@ -103,55 +94,15 @@ def load_memory(name: str) -> NeuralASM:
     return NeuralASM.pretrained(name)
 
 
-class EDetector:
-    """An e-detector as a threshold: what the next episode's greatest surprise must exceed for an alarm.
-
-    Args:
-        blocks: of calibration.
-        rate: promised false alarms per hour.
-    """
-
-    def __init__(self, blocks: Blocks, rate: float) -> None:
-        n = len(blocks.maxima)
-        p = np.arange(1, n + 1) / (n + 1)
-        # e(p) of an episode whose surprise 0, 1, … maxima reach
-        self._e_values = (1 - p + p * np.log(p)) / (p * np.log(p) ** 2)
-        self._maxima = np.sort(blocks.maxima)[::-1]
-        self._critical = n / blocks.total / rate  # c
-        self._evidence = 0.0  # M
-
-    @property
-    def value(self) -> float:
-        """The present threshold; infinite where no surprise would be evidence enough."""
-        evidence = (self._evidence + 1.0) * self._e_values
-        ranks_in_alarm = int((evidence >= self._critical).sum())
-        if not ranks_in_alarm:
-            return np.inf
-        return float(self._maxima[ranks_in_alarm - 1])
-
-    def follow(self, largest: float) -> None:
-        """Take an episode of this greatest surprise as evidence; an alarm ends all evidence."""
-        maxima_reached = int((self._maxima >= largest).sum())
-        rank = min(maxima_reached, len(self._maxima) - 1)
-        self._evidence = (self._evidence + 1.0) * float(self._e_values[rank])
-        if self._evidence >= self._critical:
-            self._evidence = 0.0
-
-
-def rules_table(
-    scores: Sequence[Scores], memory: NeuralASM, thresholds: Mapping[float, float]
-) -> Table:
+def rules_table(scores: Sequence[Scores], thresholds: Mapping[float, float]) -> Table:
     """Return a row for each promise and rule of alarm."""
-    assert memory.blocks_ is not None
     rows = []
     for rate, threshold in thresholds.items():
         hourly = [each.at(threshold) for each in scores]
         adaptive = [each.adapted(rate) for each in hourly]
-        detected = [each.under(EDetector(memory.blocks_, rate)) for each in scores]
         rows.append(rule_row(rate, "hourly threshold", hourly))
         rows.append(rule_row(rate, "threshold that follows", adaptive))
-        rows.append(rule_row(rate, "e-detector", detected))
-    caption = "Three rules of alarm, under policies and tasks that the memory never met."
+    caption = "Two rules of alarm, under policies and tasks that the memory never met."
     return kit.table_of(caption, rows)
 
 

@@ -9,7 +9,6 @@ import json
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import chain
@@ -26,9 +25,9 @@ from threadpoolctl import threadpool_limits
 from asm_gym.evaluation.figures import look, save
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown
-from asm_gym.files import write_text, written_whole
-from asm_gym.rollouts import progress
-from asm_gym.rollouts.parallel import Progress, parallel_map
+from asm_gym.files import write_text
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage as stage  # for studies
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts import command
 from asm_gym.scripts.command import Options, option
@@ -101,9 +100,7 @@ def write(path: Path, findings: Findings, config: Any, seconds: float) -> list[s
     suffixes = []
     if findings.figure is not None:
         save(findings.figure, path.with_suffix(".png"))
-        with written_whole(path.with_suffix(".svg")) as file:
-            findings.figure.savefig(file, format="svg", metadata={"Date": None})
-        suffixes = [".png", ".svg"]
+        suffixes = [".png"]
     details = {
         "arguments": asdict(config),
         "seed": config.seed,
@@ -123,11 +120,6 @@ def write(path: Path, findings: Findings, config: Any, seconds: float) -> list[s
 
 
 # ------------------------------------------------------------------ measurement
-
-
-def stage(label: str) -> AbstractContextManager[Progress]:
-    """Show the progress of a stage while the block runs; yields a function of (done, total)."""
-    return progress.stage(label, Console())
 
 
 def each(

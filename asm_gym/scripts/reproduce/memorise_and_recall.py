@@ -18,10 +18,8 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from asm_gym.data.episode import Episode
-from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import ITERATIONS, PRIOR_PRECISION, SETTLING
 from asm_gym.memory.learning import Moment, Practice, Schedule
@@ -41,7 +39,7 @@ from asm_gym.scripts.reproduce.expression import (
     trajectories,
 )
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, curves
+from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.validation import check_number
 
 MODELS = {
@@ -112,29 +110,12 @@ def run(config: Config) -> Findings:
     for n in config.repertoires:
         own = frame[(frame.skills == n) & (frame.cue < STEPS)]
         tables.append(errors(f"Offline error [cm] by cue, {n} letters", own, "cue"))
-    return Findings(records, tables, errors_figure(offline, online))
+    return Findings(records, tables)
 
 
 def errors(caption: str, records: pd.DataFrame, columns: str) -> Table:
     """Return the table of the errors of each model."""
     return kit.grid(caption, records, "error_cm", "model", columns)
-
-
-def errors_figure(offline: pd.DataFrame, online: pd.DataFrame) -> Figure:
-    """Draw the offline and the online error of each model over the number of skills."""
-    with figure(height=3.4, width=7) as fig:
-        left, right = fig.subplots(1, 2)
-        curves(left, offline, "error_cm", "skills", "model")
-        curves(right, online, "error_cm", "skills", "model")
-        left.set_ylabel("offline error [cm]")
-        right.set_ylabel("online error [cm]")
-        sizes = offline.skills.unique()
-        for ax in (left, right):
-            ax.set(xlabel="skills in the repertoire", xscale="log", ylim=0)
-            ax.set_xticks(sizes, map(str, sizes))
-        handles, labels = left.get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=8)
-    return fig
 
 
 def recall(job: tuple[int, int], config: Config) -> list[Record]:

@@ -23,9 +23,9 @@ from asm_gym.data.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import practise
-from asm_gym.memory.recurrent import (
+from asm_gym.memory.recurrent import RecurrentNetwork
+from asm_gym.memory.recurrent_learning import (
     RecurrentLearner,
-    RecurrentNetwork,
     initial_recurrent_weights,
     near_gradient,
 )

@@ -16,7 +16,7 @@ from sklearn.ensemble import RandomForestClassifier
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.readout import KEPT, certainty, learn_readout
-from asm_gym.memory.recurrent import learn_recurrent
+from asm_gym.memory.recurrent_learning import learn_recurrent
 from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.temporal import Learn, TemporalNetwork
 from asm_gym.scaling import StreamScaler

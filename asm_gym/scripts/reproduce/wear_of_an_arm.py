@@ -175,8 +175,8 @@ def table_of(records: Sequence[kit.Record], scale: WearScale) -> Table:
         }
         rows.append(row)
     return kit.table_of(
-        f"Wear of the synthetic arm, from {len(scale.spread)} numbers; blocks of {scale.block_s:g} s; "
-        "0.1 false ones an hour are promised. An encoder drifts to 0.05 rad in ten minutes, "
-        "friction grows by 20 % in an hour.",
+        f"Wear of the synthetic arm, from {len(scale.spread)} numbers; "
+        f"blocks of {scale.block_s:g} s; 0.1 false ones an hour are promised. "
+        "An encoder drifts to 0.05 rad in ten minutes, friction grows by 20 % in an hour.",
         rows,
     )
