@@ -350,7 +350,11 @@ class ValueAssociation(ScaledModel):
         senses = len(self.spec.sensory)
         joints = len(features.speeds)
         has_body = features.body is not None
-        if len(self._torques) != joints or (has_body and len(features.angles) != joints):
+        if (
+            joints == 0
+            or len(self._torques) != joints
+            or (has_body and len(features.angles) != joints)
+        ):
             return {}
         first_command = inputs - len(self.spec.commanded) - 1
         first_weight = 3 * senses + joints * (len(WIDTHS) + 2 * has_body)
