@@ -106,9 +106,7 @@ def announce(function: Any, what: str) -> bool:
     """Return whether the next call of a compiled function compiles ``what``; say so on standard error."""
     if not must_compile(function):
         return False
-    print(
-        f"asm-gym: compiling {what}, once on this machine (half a minute to two)", file=sys.stderr
-    )
+    print(f"asm-gym: compiling {what}, once on this machine (up to a minute)", file=sys.stderr)
     return True
 
 

@@ -133,10 +133,15 @@ def _fill_settings(arm: Arm, model: mujoco.MjModel, controller: Any) -> None:
         arm.controller = JOINT_POSITION
 
 
-def free_angles(model: mujoco.MjModel, joints: Any) -> tuple[Floats, Floats]:
-    """Return the least and the greatest angle of each joint that is not at a stop [rad]; infinite without stops."""
+def joint_ranges(model: mujoco.MjModel, joints: Any) -> Floats:
+    """Return (J, 2) the least and the greatest angle of each joint [rad]; infinite without stops."""
     limited = model.jnt_limited[joints].astype(bool)[:, None]
-    ranges = np.where(limited, model.jnt_range[joints], (-np.inf, np.inf))
+    return np.where(limited, model.jnt_range[joints], (-np.inf, np.inf))
+
+
+def free_angles(model: mujoco.MjModel, joints: Any) -> tuple[Floats, Floats]:
+    """Return the least and the greatest angle of each joint at which it is not at a stop [rad]."""
+    ranges = joint_ranges(model, joints)
     return ranges[:, 0] + AT_STOP, ranges[:, 1] - AT_STOP
 
 

@@ -110,12 +110,8 @@ ARM = np.dtype(
         ("controller", np.int64),  # OSC_POSE or JOINT_POSITION
         ("kp", np.float64, JOINTS),
         ("kd", np.float64, JOINTS),
-        (
-            "lowest",
-            np.float64,
-            JOINTS,
-        ),  # between these a joint is free, beyond them at its stop [rad]
-        ("highest", np.float64, JOINTS),
+        ("lowest", np.float64, JOINTS),  # a joint below it is at its stop [rad]
+        ("highest", np.float64, JOINTS),  # and one above this
         ("rest_angles", np.float64, JOINTS),  # the posture that spare joints tend to [rad]
         ("first_input", np.int64),  # where the arm's part of the action begins
         ("input_count", np.int64),  # how many numbers it has

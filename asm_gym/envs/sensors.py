@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.channel_columns import columns_where
 from asm_gym.envs import compiled_substeps as kernels
-from asm_gym.envs.arms import Part, prefix_of
+from asm_gym.envs.arms import Part, joint_ranges, prefix_of
 from asm_gym.envs.mujoco_views import Floats, Ints, Views
 from asm_gym.spec import HANDLED, MOTOR, Channel, StreamSpec
 
@@ -187,11 +187,9 @@ def _joint_stops(part: Part) -> tuple[tuple[float, float], ...]:
     """Return the least and the most of each joint [rad]; none where no joint has stops."""
     robot, _ = part
     model = robot.sim.model._model
-    joints = robot._ref_joint_indexes
-    limited = model.jnt_limited[joints].astype(bool)
-    if not limited.any():
+    ranges = joint_ranges(model, robot._ref_joint_indexes)
+    if not np.isfinite(ranges).any():
         return ()
-    ranges = np.where(limited[:, None], model.jnt_range[joints], (-np.inf, np.inf))
     return tuple((float(low), float(high)) for low, high in ranges)
 
 

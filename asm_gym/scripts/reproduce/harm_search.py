@@ -65,7 +65,7 @@ class HardestContact:
     def __init__(self, arm: Any) -> None:
         self._arm = arm
         self._model: Any = None
-        self._is_arm = np.zeros(0, bool)  # of each geom
+        self._arm_geoms = np.zeros(0, bool)  # whether each geom is one
         self._speeds: deque[float] = deque(maxlen=APPROACH_SUBSTEPS)
         self.force = 0.0
         self.bodies = ("", "")
@@ -76,8 +76,8 @@ class HardestContact:
         data = simulation.data
         if simulation.model is not self._model:
             self._model = simulation.model
-            self._is_arm = _is_arm(simulation)
-        touching = np.flatnonzero(self._is_arm[data.contact.geom].any(axis=1))
+            self._arm_geoms = _arm_geoms(simulation)
+        touching = np.flatnonzero(self._arm_geoms[data.contact.geom].any(axis=1))
         rows = data.contact.efc_address[touching]
         rows = rows[rows >= 0]
         approach = 0.0
@@ -92,7 +92,7 @@ class HardestContact:
             self.bodies = _pressing(simulation, touching)
 
 
-def _is_arm(simulation: Any) -> NDArray[np.bool_]:
+def _arm_geoms(simulation: Any) -> NDArray[np.bool_]:
     """Return which geoms are of an arm, its hand and fingers included."""
     model = simulation.model
     roots = model.body_rootid[simulation.arms.root]
