@@ -308,11 +308,18 @@ def test_small_actions_move_the_hand_less_and_the_fingers_as_before():
 
 
 def test_every_run_of_the_study_has_a_file_of_its_own():
-    config = learning_safely.Config(algorithms=learning_safely.ALGORITHMS)
-    wanted = learning_safely.runs(config)
+    wanted = learning_safely.runs(learning_safely.Config())
     names = {run.file_name for run in wanted}
-    assert len(names) == len(wanted) == 5 * 4 * (6 + 4 + 4)
+    assert len(names) == len(wanted) == 5 * 4 * (6 + 4)
     assert [run.seed for run in wanted] == sorted(run.seed for run in wanted)
+
+
+def test_an_algorithm_that_cannot_learn_in_a_way_has_no_run_and_none_at_all_is_refused():
+    config = learning_safely.Config(algorithms=("PPO", "SAC"), ways=("executed action",))
+    assert {run.algorithm for run in learning_safely.runs(config)} == {"SAC"}
+    config = learning_safely.Config(algorithms=("PPO",), ways=("executed action",))
+    with pytest.raises(ValueError, match="executed action"):
+        learning_safely.runs(config)
 
 
 def test_a_way_to_learn_looks_the_same_in_every_panel_and_the_legend_names_it_once():

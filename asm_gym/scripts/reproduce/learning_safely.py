@@ -42,6 +42,7 @@ from asm_gym.scripts.reproduce.learning_scenes import REACH, TASKS, SpeedLimited
 from asm_gym.tasks import ROBOTS
 from asm_gym.wrappers import VectorNeuralASMSafety
 
+ALGORITHMS = ("PPO", "SAC")
 ALONE = "alone"
 DEFAULT = "default"
 SLOW = 0.15  # of the fixed speed limit [m/s]
@@ -63,6 +64,10 @@ class Way:
     """What a step in alarm costs, in reward."""
     cost_limit: float | None = None
     """The mean cost of a step that the price is to lead to; None for a fixed price."""
+    executed_stored: bool = False
+    """SAC stores the action that the guard executed; else the one that it chose."""
+    algorithms: tuple[str, ...] = ALGORITHMS
+    """Which algorithms can learn so."""
 
 
 WAYS = {
@@ -71,13 +76,14 @@ WAYS = {
     "contact limits": Way(guard={"responses": GOING_ON}),
     "speed limit": Way(hand_speed=SLOW),
     "small actions": Way(action_share=SMALL),
-    "cost in reward": Way(guard={"on_alarm": "monitor"}, price=0.1),
-    "Lagrangian": Way(guard={"on_alarm": "monitor"}, cost_limit=0.05),
+    "cost in reward": Way(guard={"on_alarm": "monitor"}, price=0.1, algorithms=("PPO",)),
+    "Lagrangian": Way(guard={"on_alarm": "monitor"}, cost_limit=0.05, algorithms=("PPO",)),
     "truncated": Way(guard={"on_alarm": "terminate", "truncate": True}),
+    "executed action": Way(guard={}, executed_stored=True, algorithms=("SAC",)),
 }
 """Ways by name. *contact limits* goes on at every alarm that is no pressing; *truncated* truncates the episode at an
-alarm; *small actions* tells what slow hands alone cost."""
-PRICED = ("cost in reward", "Lagrangian")  # ways of PPO alone
+alarm; *small actions* tells what slow hands alone cost; *executed action* is the default guard, where SAC stores what
+was executed."""
 PRICE_RATE = 0.2  # of the price that follows a limit, for each rollout
 
 
@@ -98,9 +104,6 @@ class SACSettings(NamedTuple):
     gamma: float = 0.98
 
 
-ALGORITHMS = ("PPO", "SAC", "SAC, chosen action")
-
-
 @dataclass(frozen=True)
 class Config(kit.Config):
     """Agents that learn from scratch, alone and under guards."""
@@ -110,11 +113,11 @@ class Config(kit.Config):
     tasks: tuple[str, ...] = option(TASKS, quick=(REACH,), known=TASKS, metavar="TASK")
     """What is learned. Reach is Lift's scene with the reward of its first part: the hand moves to the cube."""
     algorithms: tuple[str, ...] = option(
-        ("PPO", "SAC"), quick=("PPO",), known=ALGORITHMS, metavar="NAME"
+        ALGORITHMS, quick=("PPO",), known=ALGORITHMS, metavar="NAME"
     )
-    """How it is learned. SAC stores the executed action; *SAC, chosen action* that of the policy."""
+    """How it is learned."""
     ways: tuple[str, ...] = option(
-        (ALONE, DEFAULT, "contact limits", "speed limit", *PRICED),
+        (ALONE, DEFAULT, "contact limits", "speed limit", "cost in reward", "Lagrangian"),
         quick=(ALONE, DEFAULT),
         known=WAYS,
         metavar="NAME",
@@ -162,12 +165,12 @@ class Run:
 
 
 def runs(config: Config) -> list[Run]:
-    """Return the runs of a study, seed by seed."""
+    """Return the runs of a study, seed by seed; ValueError where no algorithm learns in any way."""
     found = []
     threads = max(1, cores() // config.workers)
     conditions = product(config.repetitions, config.tasks, config.algorithms, config.ways)
     for seed, task, algorithm, way in conditions:
-        if way in PRICED and algorithm != "PPO":
+        if algorithm not in WAYS[way].algorithms:
             continue
         run = Run(
             task=task,
@@ -181,6 +184,9 @@ def runs(config: Config) -> list[Run]:
             threads=threads,
         )
         found.append(run)
+    if not found:
+        algorithms = ", ".join(config.algorithms)
+        raise ValueError(f"{algorithms} cannot learn in the ways {', '.join(config.ways)}")
     return found
 
 
@@ -225,7 +231,7 @@ def make_learner(algorithm: str, envs: LearningRecord, way: Way, seed: int) -> L
         on_policy = PPOSettings()._asdict()
         agent = PPO("MlpPolicy", scaled, seed=seed, device="cpu", **on_policy)
     else:
-        kind = ExecutedSAC if algorithm == "SAC" else SAC
+        kind = ExecutedSAC if way.executed_stored else SAC
         off_policy = SACSettings()._asdict()
         agent = kind("MlpPolicy", scaled, seed=seed, device="cpu", **off_policy)
     return Learner(agent, scaled, callbacks)
