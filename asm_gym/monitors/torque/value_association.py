@@ -53,6 +53,7 @@ from asm_gym.monitors.torque.crossfitting import (
     folds_of,
     quadratic_form,
 )
+from asm_gym.monitors.torque.regression_inputs import InputColumns, RegressionRows, inputs_of
 from asm_gym.monitors.torque.speed_precision import (
     episode_means,
     running_mean,
@@ -83,15 +84,6 @@ LEARNED = (
     "far",  # (K, I, I) leverage by each set of inputs; of none with very many inputs
     "far_of",  # (V,) which set of inputs a value is predicted from
 )
-
-
-class RegressionRows(NamedTuple):
-    """Rows as regression reads them, all standardised."""
-
-    values: Floats  # (N, X)
-    changes: Floats  # (N, X)
-    before: Floats  # (N, X) values l rows before
-    commands: Floats  # (N, A + 1) with a 1
 
 
 class AveragedErrors(NamedTuple):
@@ -314,67 +306,34 @@ class ValueAssociation(ScaledModel):
         mean = derived.mean(axis=0)
         spread = np.maximum(derived.std(axis=0), LEAST_REMAINDER)
         inputs = inputs_of(rows, (derived - mean) / spread)
-        size = inputs.shape[1]
-        check_inputs(size)
+        check_inputs(inputs.shape[1])
+        columns = InputColumns.of(
+            senses=rows.values.shape[1],
+            features=derived.shape[1],
+            commands=rows.commands.shape[1],
+        )
+        groups = self.senses_.groups
         regression = CrossFit(
             FoldEquations.of(inputs, rows.values, fold),
-            by_arm=self._arm_inputs(features, size),
-            groups=self.senses_.groups,
-            withheld=self._withheld(features),
+            by_arm=self._arms_by_torque(features, columns),
+            groups=groups,
+            withheld=columns.withheld(groups, features),
         )
         return FeatureFit(features, mean, spread, regression)
 
-    def _withheld(self, features: ArmFeatures) -> list[Places]:
-        """Return the inputs of each group that hold its own values, which it is not predicted from."""
-        # Columns of ``inputs_of``: values, changes, values before, features, commands.
-        senses = len(self.spec.sensory)
-        groups = self.senses_.groups
-        before = 2 * senses + np.arange(senses)  # a value is predicted from this row alone
-        withheld = []
-        for group in range(int(groups.max()) + 1):
-            own_values = np.flatnonzero(groups == group)
-            own_changes = senses + own_values
-            from_own_values = features.sources[:, own_values].any(axis=1)
-            own_features = 3 * senses + np.flatnonzero(from_own_values)
-            withheld.append(np.hstack([own_values, own_changes, before, own_features]))
-        return withheld
-
-    def _arm_inputs(self, features: ArmFeatures, inputs: int) -> dict[int, list[Places]]:
+    def _arms_by_torque(
+        self, features: ArmFeatures, columns: InputColumns
+    ) -> dict[int, list[Places]]:
         """Return the sets of inputs that model the arm at each torque.
 
-        All hold the friction of its joint, and commands; besides weight by sines and accelerations, or weight and
-        motion by the body and its own acceleration, or all of these. There are none where torques, speeds and angles
-        of a body model do not belong together one by one.
+        There are none where torques, speeds and angles of a body model do not belong together one by one.
         """
-        # Columns of ``inputs_of``: values, changes, values before, features, commands.
-        senses = len(self.spec.sensory)
         joints = len(features.speeds)
-        has_body = features.body is not None
-        if (
-            joints == 0
-            or len(self._torques) != joints
-            or (has_body and len(features.angles) != joints)
-        ):
+        if len(self._torques) != joints:
             return {}
-        first_command = inputs - len(self.spec.commanded) - 1
-        first_weight = 3 * senses + joints * (len(WIDTHS) + 2 * has_body)
-        # Each feature of friction and body of all joints comes before the next, and sines follow.
-        own_features = np.arange(3 * senses, first_weight).reshape(-1, joints)
-        accelerations = senses + features.speeds
-        speeds = accelerations
-        if not features.from_changes:
-            speeds = features.speeds
-        by_sines = np.hstack([np.arange(first_weight, first_command), accelerations])
-        commands = np.arange(first_command, inputs)
-        arm_inputs = {}
-        for joint, torque in enumerate(self._torques.tolist()):
-            common = [speeds[[joint]], own_features[: len(WIDTHS), joint], commands]
-            by_body = [own_features[len(WIDTHS) :, joint], accelerations[[joint]]]
-            candidates = [[*common, by_sines]]
-            if has_body:
-                candidates += [[*common, *by_body], [*common, *by_body, by_sines]]
-            arm_inputs[torque] = [np.unique(np.hstack(one)) for one in candidates]
-        return arm_inputs
+        if features.body is not None and len(features.angles) != joints:
+            return {}
+        return dict(zip(self._torques.tolist(), columns.of_joints(features), strict=True))
 
     def _weighed_errors(self, fit: FeatureFit, judged: Places) -> tuple[Floats, Floats, Places]:
         """Weigh cross-fitted errors by leverage.
@@ -408,8 +367,3 @@ class ValueAssociation(ScaledModel):
         by_matrix = np.stack([quadratic_form(inputs, matrix) for matrix in matrices], axis=1)
         leverage = by_matrix[:, self.learned_["far_of"].astype(np.intp)]
         return np.sqrt(np.maximum(1.0, leverage))
-
-
-def inputs_of(rows: RegressionRows, features: Floats) -> Floats:
-    """Return the inputs (N, I) of regression for rows with standardised features (N, M)."""
-    return np.hstack([rows.values, rows.changes, rows.before, features, rows.commands])
