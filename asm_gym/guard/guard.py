@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.alarm_rule import FAULT_EVENT, KNOCK_EVENT
 from asm_gym.guard.acknowledgement import Acknowledgements
 from asm_gym.guard.adapter import SensedRows
-from asm_gym.guard.alarm_terms import BY_CAUSE, CONTACT, SURPRISE, AlarmTerms
+from asm_gym.guard.alarm_terms import AlarmTerms
 from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.chunk_preview import Preview, one_row_each, preview_chunk
 from asm_gym.guard.commander import Command, Commander, Observe
@@ -35,7 +34,7 @@ from asm_gym.guard.judged_rows import JudgedRow, RowJudge
 from asm_gym.guard.observer import Observer, invalid_surprises, merged_failures
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, MotionArrays
-from asm_gym.guard.responses import SLOW, Response, responses_from, unexplained
+from asm_gym.guard.responses import SLOW, responses_from
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.guard.robot_table import (
     REFLEX,
@@ -46,9 +45,9 @@ from asm_gym.guard.robot_table import (
     copied,
     damaged,
 )
-from asm_gym.guard.row_evidence import RowEvidence
+from asm_gym.guard.row_decisions import RowDecider
 from asm_gym.guard.row_validation import RowValidator
-from asm_gym.guard.step_info import Outcome, RowReport
+from asm_gym.guard.step_info import RowReport
 from asm_gym.guard.wear_watch import WearWatch
 from asm_gym.monitors import Monitor
 from asm_gym.monitors.expectation import LevelShift
@@ -123,6 +122,14 @@ class Guard:
         responses = responses_from(options.responses, can_slow=facts.limits_contact)
         self._diagnostician = Diagnostician(spec, diagnosis, responses, self._graded)
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
+        self._decider = RowDecider(
+            table=self.table,
+            terms=self.terms,
+            validator=self._validator,
+            diagnostician=self._diagnostician,
+            arbiter=self._arbiter,
+            graded=self._graded,
+        )
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
         self._row_judge = self._new_row_judge(motion)
         self._commander = self._new_commander(motion, policies, monitor)
@@ -427,69 +434,12 @@ class Guard:
                 self._warn(robot, failure, "which counts as an alarm")
         row.terms = self.terms.masks(self.table)
         for robot in np.flatnonzero(records["must_decide"]).tolist():
-            row.outcomes[robot] = self._decide_about(robot, row)
+            outcome = self._decider.decide(robot, row)
+            row.outcomes[robot] = outcome
+            if outcome.decision.takes_over:
+                self._commander.start_override(robot, row.executed[robot])
         self._forget_evidence(row)
         self._validator.drop_repairs()
-
-    def _decide_about(self, index: int, row: JudgedRow) -> Outcome:
-        """Return what is done about the row of one robot."""
-        evidence = self._evidence(index, row)
-        robot = evidence.robot
-        response = self._respond(evidence)
-        if not robot.overridden and np.isfinite(robot.surprise):
-            warning = self._arbiter.count_policy_row(evidence)
-            if warning:
-                warnings.warn(warning, stacklevel=5)
-
-        decision = self._arbiter.decide(evidence, response)
-        if decision.takes_over:
-            self._commander.start_override(index, row.executed[index])
-        self.terms.count(evidence.terms)
-        if not evidence.alarm:
-            return Outcome(response=response, decision=decision)
-        robot.alarm = True
-        robot.event = FAULT_EVENT
-        only_felt = set(evidence.terms) <= {CONTACT, SURPRISE}
-        if only_felt and not robot.over:
-            # A contact and no fault: surprise is under its threshold, or a knock excuses it.
-            robot.event = KNOCK_EVENT
-        return Outcome(evidence.terms, response, decision)
-
-    def _evidence(self, index: int, row: JudgedRow) -> RowEvidence:
-        """Return what is known of the row of one robot."""
-        return RowEvidence(
-            index=index,
-            robot=self.table.robot(index),
-            rows=self._validator.last(index),
-            attribution=row.attribution[index],
-            accounted_for=self._validator.accounted_for(index),
-            terms=tuple(name for name, mask in row.terms.items() if mask[index]),
-            contradiction=row.contradictions.get(index),
-            completed=self._validator.completed_names(index),
-            may_go_on=self._arbiter.may_go_on(index),
-        )
-
-    def _respond(self, evidence: RowEvidence) -> Response:
-        """Return what is to be done about a row, once the sensors at fault are completed."""
-        if not evidence.alarm:
-            return self._diagnostician.watch(evidence)
-        reason = evidence.terms[0]
-        response_of_term = self.terms.terms[reason].response
-        if response_of_term != BY_CAUSE and self._graded:
-            return unexplained(response_of_term, reason)
-
-        response, blamed_columns = self._diagnostician.prescribe(evidence)
-        completes = response.name == "complete"
-        blames_sensors = blamed_columns.size > 0 or (completes and not evidence.only_lost)
-        if not blames_sensors:  # numbers that are only missing are completed already
-            return response
-
-        is_completed = self._validator.suspect(evidence.index, blamed_columns)
-        if is_completed:
-            self._diagnostician.close(evidence.index)  # it begins anew, on the completed rows
-        elif completes:
-            return self._diagnostician.instead_of_completing(response)
-        return response
 
     def _forget_evidence(self, row: JudgedRow) -> None:
         """Clear a robot's evidence where it was acted on, or comes from rows that were not yet repaired."""
