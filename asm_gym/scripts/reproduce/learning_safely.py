@@ -60,6 +60,8 @@ class Way:
     """A fixed limit of the hand's speed, without a guard [m/s]."""
     action_share: float = 1.0
     """What a full action of the agent is of one of the environment; that of the fingers stays."""
+    first_spread: float = 1.0
+    """Standard deviation of PPO's actions when it begins, in full actions."""
     price: float = 0.0
     """What a step in alarm costs, in reward."""
     cost_limit: float | None = None
@@ -76,14 +78,20 @@ WAYS = {
     "contact limits": Way(guard={"responses": GOING_ON}),
     "speed limit": Way(hand_speed=SLOW),
     "small actions": Way(action_share=SMALL),
+    "small noise": Way(guard={}, first_spread=SMALL, algorithms=("PPO",)),
+    "small noise, alone": Way(first_spread=SMALL, algorithms=("PPO",)),
     "cost in reward": Way(guard={"on_alarm": "monitor"}, price=0.1, algorithms=("PPO",)),
     "Lagrangian": Way(guard={"on_alarm": "monitor"}, cost_limit=0.05, algorithms=("PPO",)),
     "truncated": Way(guard={"on_alarm": "terminate", "truncate": True}),
     "executed action": Way(guard={}, executed_stored=True, algorithms=("SAC",)),
 }
-"""Ways by name. *contact limits* goes on at every alarm that is no pressing; *truncated* truncates the episode at an
-alarm; *small actions* tells what slow hands alone cost; *executed action* is the default guard, where SAC stores what
-was executed."""
+"""Ways by name.
+
+- *contact limits* goes on at every alarm that is no pressing, *truncated* truncates the episode at an alarm.
+- *small actions* tells what slow hands alone cost.
+- *small noise* begins with as much noise as the guard lets through where nothing is near; beside it the same alone.
+- *executed action* is the default guard, and SAC stores what was executed.
+"""
 PRICE_RATE = 0.2  # of the price that follows a limit, for each rollout
 
 
@@ -229,7 +237,8 @@ def make_learner(algorithm: str, envs: LearningRecord, way: Way, seed: int) -> L
     agent: BaseAlgorithm
     if algorithm == "PPO":
         on_policy = PPOSettings()._asdict()
-        agent = PPO("MlpPolicy", scaled, seed=seed, device="cpu", **on_policy)
+        spread = {"log_std_init": math.log(way.first_spread)}
+        agent = PPO("MlpPolicy", scaled, seed=seed, device="cpu", policy_kwargs=spread, **on_policy)
     else:
         kind = ExecutedSAC if way.executed_stored else SAC
         off_policy = SACSettings()._asdict()
