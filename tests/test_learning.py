@@ -322,6 +322,19 @@ def test_an_algorithm_that_cannot_learn_in_a_way_has_no_run_and_none_at_all_is_r
         learning_safely.runs(config)
 
 
+def test_ways_are_compared_with_learning_alone_in_pairs_of_seeds():
+    cell = {"robot": "Panda", "task": "Lift", "algorithm": "PPO"}
+    rewards = {("alone", 0): 1.0, ("alone", 1): 5.0, ("default", 1): 8.0, ("default", 2): 9.0}
+    runs = [
+        cell | {"way": way, "seed": seed} | dict.fromkeys(learning_tables.DIFFERENCES, reward)
+        for (way, seed), reward in rewards.items()
+    ]
+    table = learning_tables.difference_table(pd.DataFrame(runs))
+    (cells,) = table.rows
+    row = dict(zip(table.headings, cells, strict=True))
+    assert (row["way"], row["seeds"], row["reward, last fifth"]) == ("default", "1", "3.0")
+
+
 def test_a_way_to_learn_looks_the_same_in_every_panel_and_the_legend_names_it_once():
     runs = (("Door", "default"), ("Lift", "alone"), ("Lift", "default"))
     points = [

@@ -21,6 +21,13 @@ TARGETS = {"Lift": 12.0, "Door": 18.0, "Stack": 5.0, "Reach": 30.0}
 """Reward of an episode, in the mean of ``SMOOTHED`` episodes, that an agent is to come to."""
 SMOOTHED = 20
 CELL = ["robot", "task", "algorithm", "way"]
+DIFFERENCES = [
+    "last_reward",
+    "last_success",
+    "alone_success",
+    "default_success",
+    "default_reward",
+]
 BINS = 16  # points of a curve
 FIFTH = 0.2  # share of the steps that counts as the beginning, or the end, of learning
 ALONE = "alone"
@@ -31,6 +38,8 @@ def findings(results: Sequence[Record], paces: Sequence[Record]) -> kit.Findings
     frame = pd.DataFrame([summary(result) for result in results])
     curves = [point for result in results for point in curve(result)]
     tables = [learning_table(frame), trained_table(frame), wear_table(frame)]
+    if (frame.way == ALONE).any():
+        tables.insert(1, difference_table(frame))
     if paces:
         tables.append(pace_table(pd.DataFrame(paces)))
     records = frame.to_dict(orient="records") + curves + list(paces)
@@ -127,13 +136,40 @@ def cell(values: Any, digits: int = 0, scale: float = 1.0) -> str:
     return Estimate.of_mean(known.tolist()).text(digits)
 
 
-def share_of_alone(group: pd.DataFrame, frame: pd.DataFrame) -> str:
-    """Return the harm as a share of that alone with the same seed [%]."""
+def alone_of(group: pd.DataFrame, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs of a group's task and algorithm alone, by seed."""
     same = frame[frame.way == ALONE]
     for name in ("robot", "task", "algorithm"):
         same = same[same[name] == group.iloc[0][name]]
-    pairs = group.set_index("seed").harm / same.set_index("seed").harm
+    return same.set_index("seed")
+
+
+def share_of_alone(group: pd.DataFrame, frame: pd.DataFrame) -> str:
+    """Return the harm as a share of that alone with the same seed [%]."""
+    pairs = group.set_index("seed").harm / alone_of(group, frame).harm
     return cell(pairs, digits=2, scale=100.0)
+
+
+def difference_table(frame: pd.DataFrame) -> Table:
+    """Return how much more each way leads to than learning alone with the same seed."""
+    rows = []
+    for _, group in frame[frame.way != ALONE].groupby(CELL, sort=False):
+        alone = alone_of(group, frame)
+        own = group.set_index("seed")
+        seeds = own.index.intersection(alone.index)
+        difference = own.loc[seeds, DIFFERENCES] - alone.loc[seeds, DIFFERENCES]
+        rows.append(
+            {
+                **name_of(group),
+                "seeds": str(len(seeds)),
+                "reward, last fifth": cell(difference.last_reward, 1),
+                "solved, last fifth [%]": cell(difference.last_success, 0, 100.0),
+                "trained: solved, alone [%]": cell(difference.alone_success, 0, 100.0),
+                "solved, default [%]": cell(difference.default_success, 0, 100.0),
+                "reward, default": cell(difference.default_reward, 1),
+            }
+        )
+    return kit.table_of("More than alone with the same seed; 95 % intervals of Student's t", rows)
 
 
 def learning_table(frame: pd.DataFrame) -> Table:
