@@ -188,8 +188,10 @@ def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
     env.reset(seed=0)
     infos = [env.step(ACT)[4] for _ in range(8)]
     assert [i["cost_sum"] for i in infos] == [0, 1, 2, 2, 2, 2, 3, 3]
+    assert [i["asm_steps"] for i in infos] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert infos[-1]["asm"]["alarms"] == 3
-    assert env.reset(seed=0)[1]["cost_sum"] == 0
+    begun = env.reset(seed=0)[1]
+    assert begun["cost_sum"] == begun["asm_steps"] == 0
 
 
 # ---------------------------------------------------------------- guards around guards, and memories of others

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorWrapper
 from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from asm_gym.evaluation.statistics import Estimate
 from asm_gym.exceptions import UnsupportedEnvironment
@@ -128,6 +128,56 @@ def test_actions_changed_outside_the_guard_are_refused(many, scaled):
         ExecutedSAC("MlpPolicy", envs)
 
 
+class Scales(gym.Wrapper):
+    """Takes other actions than the guard, and is no ActionWrapper."""
+
+    def __init__(self, env, largest, share):
+        super().__init__(env)
+        self.action_space = gym.spaces.Box(-largest, largest, env.action_space.shape, np.float32)
+        self._share = np.float32(share)
+
+    def step(self, action):
+        return self.env.step(self._share * action)
+
+
+class LeavesOut(Scales):
+    def __init__(self, env):
+        super().__init__(env, 1.0, 1.0)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def step(self, action):
+        return self.env.step(np.append(action, np.float32(0.0)))
+
+
+def guarded_fake(cue=(2,)):
+    return NeuralASMSafety(FakeEnv(length=8), CueMonitor(cue), on_alarm="hold")
+
+
+def scaled_fake():
+    return Scales(guarded_fake(), largest=10.0, share=0.1)
+
+
+@pytest.mark.parametrize("outside", [scaled_fake, lambda: LeavesOut(guarded_fake())])
+def test_another_action_space_outside_the_guard_is_refused(outside):
+    with pytest.raises(UnsupportedEnvironment, match="outside the guard"):
+        ExecutedSAC("MlpPolicy", outside())
+
+
+def test_another_action_space_in_another_process_is_refused():
+    envs = SubprocVecEnv([scaled_fake], start_method="spawn")
+    try:
+        with pytest.raises(UnsupportedEnvironment, match="outside the guard"):
+            ExecutedSAC("MlpPolicy", envs)
+    finally:
+        envs.close()
+
+
+def test_actions_changed_within_their_space_are_refused_when_they_are_met():
+    agent = ExecutedSAC("MlpPolicy", Scales(guarded_fake(()), largest=1.0, share=0.5), seed=0)
+    with pytest.raises(UnsupportedEnvironment, match="outside the guard"):
+        agent.learn(8)
+
+
 def test_ppo_learns_from_its_own_actions_where_a_wrapper_rescales_them():
     guarded = NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="monitor")
     chosen = []
@@ -153,8 +203,9 @@ class HidesEnds(gym.Wrapper):
         return observation, reward, False, False, info
 
 
-def test_a_wrapper_that_hides_ends_is_named():
-    hidden = HidesEnds(NeuralASMSafety(FakeEnv(length=8), CueMonitor((2,)), on_alarm="monitor"))
+@pytest.mark.parametrize("cue", [(2,), ()])
+def test_a_wrapper_that_hides_ends_is_named_with_alarms_and_without(cue):
+    hidden = HidesEnds(NeuralASMSafety(FakeEnv(length=8), CueMonitor(cue), on_alarm="monitor"))
     agent = PPO("MlpPolicy", hidden, n_steps=32, batch_size=32)
     with pytest.raises(ValueError, match="hides that the episode ended"):
         agent.learn(32, SafetyCallback())
@@ -166,6 +217,16 @@ def test_a_memory_that_alarms_in_most_first_steps_is_named(cue, warns, recwarn):
     agent = PPO("MlpPolicy", guarded, n_steps=FIRST_STEPS, batch_size=250, n_epochs=1)
     agent.learn(FIRST_STEPS, SafetyCallback())
     assert warns == any("first 1000 steps" in str(each.message) for each in recwarn)
+
+
+def test_a_memory_whose_few_alarms_stop_the_agent_in_most_first_steps_is_named(recwarn):
+    env = FakeEnv(length=8)
+    guarded = NeuralASMSafety(env, CueMonitor((1,)), on_alarm="hold", release_after=10)
+    agent = PPO("MlpPolicy", guarded, n_steps=FIRST_STEPS, batch_size=250, n_epochs=1)
+    callback = SafetyCallback()
+    agent.learn(FIRST_STEPS, callback)
+    assert np.mean([episode["cost"] for episode in callback.ended]) < 4
+    assert any("first 1000 steps" in str(each.message) for each in recwarn)
 
 
 # ------------------------------------------------------------------ records

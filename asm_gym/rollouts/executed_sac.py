@@ -17,6 +17,7 @@ from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 
 CHANGES_ACTIONS = gym.ActionWrapper | VectorActionWrapper
 GUARDS = NeuralASMSafety | VectorNeuralASMSafety
+ROUNDING = 1e-3  # of an action scaled to 1, by which two numbers are still the same
 
 
 class ExecutedSAC(SAC):
@@ -26,7 +27,7 @@ class ExecutedSAC(SAC):
 
     Raises:
         UnsupportedEnvironment: a wrapper outside the guard changes actions, so that the executed action is none of the
-            learner's.
+            learner's. What no class or action space shows is raised in the first step that differs.
 
     Example:
         >>> import gymnasium as gym
@@ -59,22 +60,50 @@ class ExecutedSAC(SAC):
         for n, info in enumerate(infos):
             if "asm" in info:
                 executed[n] = self.policy.scale_action(info["asm"]["executed_action"])
+                if let_through(info) and not np.allclose(executed[n], action[n], atol=ROUNDING):
+                    raise changed_by("a wrapper")
         super()._store_transition(buffer, executed, next_observation, reward, dones, infos)
+
+
+def let_through(info: dict[str, Any]) -> bool:
+    """Return whether the guard let the action of a step through as it was."""
+    return not info["asm_intervened"] and info["asm"]["slowed"] == 0.0
 
 
 def refuse_changed_actions(envs: VecEnv | None) -> None:
     """Raise UnsupportedEnvironment for a wrapper outside a guard that changes the learner's actions."""
+    if envs is None:
+        return
     for member in members_of(envs):
         changes = ""
         for layer in layers(member):
             if isinstance(layer, GUARDS) and changes:
-                raise UnsupportedEnvironment(
-                    f"{changes} outside the guard gives the learner other actions than the guard "
-                    "executes, so that no executed action can be stored",
-                    advice="leave it out, or learn from the chosen actions (SAC, or on-policy PPO)",
-                )
+                raise changed_by(changes)
             if isinstance(layer, CHANGES_ACTIONS):
                 changes = type(layer).__name__
+    if any(space != envs.action_space for space in guarded_spaces(envs)):
+        raise changed_by("a wrapper")
+
+
+def guarded_spaces(envs: VecEnv) -> list[gym.Space[Any]]:
+    """Return the action spaces of the guards in a learner's vector, also of members in other processes."""
+    members = members_of(envs)
+    if not members:
+        try:
+            return envs.get_attr("guarded_action_space")
+        except AttributeError:  # no guard
+            return []
+    guards = [layer for member in members for layer in layers(member) if isinstance(layer, GUARDS)]
+    return [guard.guarded_action_space for guard in guards]
+
+
+def changed_by(wrapper: str) -> UnsupportedEnvironment:
+    """Return the error that says what a wrapper does to the learner's actions."""
+    return UnsupportedEnvironment(
+        f"{wrapper} outside the guard gives the learner other actions than the guard executes, so "
+        "that no executed action can be stored",
+        advice="leave it out, or learn from the chosen actions (SAC, or on-policy PPO)",
+    )
 
 
 def members_of(envs: VecEnv | None) -> list[Any]:

@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from asm_gym.readings import spans
 
-FIRST_STEPS = 1_000  # after which it is said whether most of them were in alarm
+FIRST_STEPS = 1_000  # after which it is said whether the agent could act in most of them
 
 
 class GuardedStep(NamedTuple):
@@ -51,7 +51,7 @@ class SafetyCallback(BaseCallback):
     contact force [N]. ``safety/impulse``: contact force beyond 40 N, summed over time [N s]. ``safety/joint_stops`` and
     ``safety/self_contacts``: joints at their stops, and contacts of the robot with itself, summed over steps.
 
-    After the first 1,000 steps it warns where most of them were in alarm.
+    After the first 1,000 steps it warns where most of them were in alarm, or a reflex acted.
 
     Raises:
         KeyError: the environment is not guarded.
@@ -62,11 +62,11 @@ class SafetyCallback(BaseCallback):
         super().__init__()
         self.ended: list[dict[str, float]] = []  # the numbers of all episodes that have ended
         self._steps_seen = 0
-        self._alarms_seen = 0
+        self._stopped_seen = 0
 
     def _on_training_start(self) -> None:
         self._steps: list[list[GuardedStep]] = [[] for _ in range(self.training_env.num_envs)]
-        self._cost_sums = np.zeros(self.training_env.num_envs)
+        self._last_steps = np.zeros(self.training_env.num_envs, np.int64)  # of the episode
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
@@ -74,7 +74,7 @@ class SafetyCallback(BaseCallback):
         for member, (info, done) in enumerate(zip(infos, dones, strict=True)):
             if "asm" not in info:
                 raise KeyError('info has no "asm": wrap the environment in NeuralASMSafety')
-            self._check_end(member, float(info["cost_sum"]), bool(done))
+            self._check_end(member, int(info["asm_steps"]), bool(done))
             step = GuardedStep.of(info)
             self._count(step)
             self._steps[member].append(step)
@@ -83,25 +83,25 @@ class SafetyCallback(BaseCallback):
                 self._steps[member].clear()
         return True
 
-    def _check_end(self, member: int, cost_sum: float, done: bool) -> None:
+    def _check_end(self, member: int, steps: int, done: bool) -> None:
         """Raise ValueError where the guard began an episode, and the learner was told of no end."""
-        if cost_sum < self._cost_sums[member]:
+        if steps <= self._last_steps[member]:
             raise ValueError(
-                f'info["cost_sum"] of environment {member} fell from '
-                f"{self._cost_sums[member]:g} to {cost_sum:g} within an episode of the learner: "
-                "a wrapper outside the guard resets it and hides that the episode ended. Pass "
-                "terminated and truncated on to the learner"
+                f"the guard of environment {member} began an episode within one of the learner: "
+                f'info["asm_steps"] is {steps} after {self._last_steps[member]}. A wrapper outside '
+                "the guard resets it and hides that the episode ended. Pass terminated and "
+                "truncated on to the learner"
             )
-        self._cost_sums[member] = 0.0 if done else cost_sum
+        self._last_steps[member] = 0 if done else steps
 
     def _count(self, step: GuardedStep) -> None:
-        """Count a step, and warn once where most of the first ones are in alarm."""
+        """Count a step, and warn once where the agent could not act in most of the first ones."""
         self._steps_seen += 1
-        self._alarms_seen += step.alarm
-        if self._steps_seen == FIRST_STEPS and 2 * self._alarms_seen > FIRST_STEPS:
+        self._stopped_seen += step.alarm or step.overridden
+        if self._steps_seen == FIRST_STEPS and 2 * self._stopped_seen > FIRST_STEPS:
             warnings.warn(
-                f"{self._alarms_seen} of the first {FIRST_STEPS} steps of learning are in alarm: "
-                "the memory does not know how this agent explores, and the agent learns little. "
+                f"{self._stopped_seen} of the first {FIRST_STEPS} steps of learning are in alarm, "
+                "or a reflex acts: the memory does not know how this agent explores, and the agent learns little. "
                 "Use a memory of the body, as NeuralASMSafety(env) does or asm-gym babble records; "
                 'or on_alarm="monitor", under which nothing is held and no contact is limited',
                 stacklevel=2,

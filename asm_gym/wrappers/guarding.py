@@ -54,7 +54,8 @@ class Guarding:
     _view: StreamView  # of them, as the monitor reads them
     _period: float  # control period [s]
     _rows_per_step = 1
-    _alarms: NDArray[np.int64]  # (n,) steps in alarm so far in the running episodes
+    _steps: NDArray[np.int64]  # (n,) done so far in the running episodes
+    _alarms: NDArray[np.int64]  # (n,) of these in alarm
 
     def __init__(
         self,
@@ -166,6 +167,7 @@ class Guarding:
             "asm_intervened": intervened,
             "cost": alarm.astype(np.float64),
             "cost_sum": self._alarms.astype(np.float64),
+            "asm_steps": self._steps.copy(),
         }
         asm = LazyInfo(self._describe(reports))
         # Learners read it in every step: it is there without the rest.

@@ -43,8 +43,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     ``info["asm"]`` describes the step; ``asm_gym.guard.step_info.AsmInfo`` lists its fields. Beside it are flat NumPy
     scalars: ``asm_surprise``, ``asm_alarm``, ``asm_intervened``, ``cost`` (1.0 in every step in alarm), ``cost_sum``
-    (of the episode), and ``overridden`` (the policy's action was not executed: a recurrent policy keeps its previous
-    state).
+    (of the episode), ``asm_steps`` (done in the episode), and ``overridden`` (the policy's action was not executed: a
+    recurrent policy keeps its previous state).
 
     Guards may be nested: the strictest contact limits and speeds apply, and cost and alarm combine all guards, while
     ``info["asm"]`` describes the outermost.
@@ -143,6 +143,11 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Time that a step takes [s]."""
         return self._period
 
+    @property
+    def guarded_action_space(self) -> gym.Space[Any]:
+        """The actions that this guard takes, whatever wrappers outside make of them."""
+        return self.action_space
+
     def confirm_alarm(self) -> None:
         """Confirm that the alarms of this episode were real, for ``adaptive_threshold``."""
         self.guard.confirm(np.ones(1, bool))
@@ -159,6 +164,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._observation = observation
         self._first_info = info
         self._row: Floats32 | None = None  # (D,) sensed last in this episode
+        self._steps = np.zeros(1, np.int64)
         self._alarms = np.zeros(1, np.int64)
         self._solved = False
         self._preview = Preview(at=None)
@@ -233,6 +239,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._limit_contact()
         self._observation = self._repaired(observation, info)
         info["overridden"] = overridden or bool(info.get("overridden"))
+        self._steps += 1
         self.report_step(self._reports, info)
 
         if self._stopped(self._reports)[0]:

@@ -32,9 +32,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     """Guard the n members of a vector environment, with one batched ``observe`` for all of them.
 
     Other arguments and reports are those of ``NeuralASMSafety``. The arrays in ``info["asm"]`` have a first axis of
-    length n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]`` and,
-    after a step, ``info["overridden"]`` have the shape (n,). If the monitor raises, all environments are in alarm. In
-    the first step of an episode surprise is 0 and ``executed_action`` NaN.
+    length n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``,
+    ``info["asm_steps"]`` and, after a step, ``info["overridden"]`` have the shape (n,). If the monitor raises, all
+    environments are in alarm. In the first step of an episode surprise is 0 and ``executed_action`` NaN.
 
     Args:
         env: from ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``. Without ``info["stream"]``,
@@ -86,6 +86,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if self._facts.brakes:
             # Who is held is held in all steps that wrappers in between make of one.
             self._members.set_attr("keeps_holding", [True] * env.num_envs)
+        self._steps = np.zeros(env.num_envs, np.int64)
         self._alarms = np.zeros(env.num_envs, np.int64)
         self._ended: Mask | None = None  # (n,) None before the first reset, and where a step failed
         # ended by this wrapper, which the environment does not know yet
@@ -119,6 +120,11 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     def threshold(self) -> NDArray[np.float64]:
         """(n,) surprise above which a row is an alarm in the running episodes."""
         return self.guard.threshold
+
+    @property
+    def guarded_action_space(self) -> gym.Space[Any]:
+        """The actions that this guard takes of each member, whatever wrappers outside make of them."""
+        return self.single_action_space
 
     def confirm_alarm(self, which: Mask | None = None) -> None:
         """Confirm the alarms of the environments ``which`` (n,), by default of all; see ``NeuralASMSafety``."""
@@ -183,6 +189,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._commanded[begun] = np.nan
         self._executed = self._facts.executed_in(sensed.rows, self._commanded)
         self._ended = np.zeros_like(begun)
+        self._steps += 1
         self._begin(begun)
         self._present = np.ones_like(begun)
         self.report_step([report], infos)
@@ -287,6 +294,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         assert self._ended is not None
         self._ended[begun] = False
         self._forced[begun] = False
+        self._steps[begun] = 0
         self._alarms[begun] = 0
         if not begun.any():
             return self.guard.empty_report()
