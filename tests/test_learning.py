@@ -341,7 +341,7 @@ def test_harm_is_compared_with_that_of_the_same_seed():
     rows = [dict(zip(found.tables[0].headings, row, strict=True)) for row in found.tables[0].rows]
     default = next(row for row in rows if row["way"] == "default")
     shares = Estimate.of_mean([1.0, 3.0])
-    assert default["of that alone [%]"] == shares.text(2)
+    assert default["% of alone"] == shares.text(2)
     assert default["overridden [%]"].startswith("10.0")
     # 10 episodes of 100 steps of 0.05 s
     assert found.records[2]["harm_hour"] == pytest.approx(1.0 / (50 / 3600))

@@ -104,5 +104,16 @@ def _kill_myself(how: int) -> None:
     os.kill(os.getpid(), how)
 
 
+def test_processes_work_for_a_program_whose_streams_are_closed(tmp_path):
+    program = (
+        "import sys; sys.stdout = sys.stderr = None\n"
+        "from pathlib import Path\n"
+        "from asm_gym.rollouts.parallel import parallel_map\n"
+        f"Path({str(tmp_path / 'sums')!r}).write_text(str(parallel_map(abs, [-1, -2], 2)))"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+    assert (tmp_path / "sums").read_text() == "[1, 2]"
+
+
 def test_nothing_to_do_needs_nobody():
     assert parallel_map(abs, [], 2) == []

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from functools import partial
 from typing import Any, TypeVar
 
@@ -66,7 +68,7 @@ def parallel_map(
             report(len(results), total)
     elif items:
         pickled = _pickled(task)
-        with _loky(min(workers, total)) as executor:
+        with _streams_to_flush(), _loky(min(workers, total)) as executor:
             futures = {executor.submit(_call, pickled, item): n for n, item in enumerate(items)}
             for future in as_completed(futures):
                 results[futures[future]] = future.result()
@@ -113,6 +115,18 @@ def _loky(workers: int) -> Iterator[Any]:
         # after an error or a Ctrl-C nothing runs on
         executor.shutdown(wait=True, kill_workers=True)
         raise
+
+
+@contextmanager
+def _streams_to_flush() -> Iterator[None]:
+    """Stand in for standard streams that are closed: loky flushes both before it starts a process."""
+    unread = io.StringIO()
+    with ExitStack() as stack:
+        if sys.stdout is None:
+            stack.enter_context(redirect_stdout(unread))
+        if sys.stderr is None:
+            stack.enter_context(redirect_stderr(unread))
+        yield
 
 
 @contextmanager

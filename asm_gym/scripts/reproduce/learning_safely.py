@@ -134,7 +134,7 @@ class Config(kit.Config):
     robot: str = option("Panda", known=ROBOTS)
     """The arm."""
     steps: int = option(40_960, quick=1_024, least=1)
-    """Control steps of each run."""
+    """Control steps of each run; PPO rounds up to whole rollouts, of 256 steps of each environment."""
     envs: int = option(8, quick=2, least=1)
     """Environments side by side."""
     evaluation_episodes: int = option(24, quick=2, least=1)
@@ -300,35 +300,61 @@ def columns(episodes: Sequence[kit.Record]) -> kit.Record:
 # ------------------------------------------------------------------ pace
 
 
-def measure_pace(task: str, robot: str, count: int, blocks: int, threads: int) -> list[kit.Record]:
-    """Return how many steps a second PPO makes in a vector, alone and under the default guard in turn.
+class Pace(NamedTuple):
+    """A comparison of steps a second, alone and under the default guard."""
+
+    task: str
+    robot: str
+    envs: int
+    blocks: int
+
+    @property
+    def file_name(self) -> str:
+        """Name of its file."""
+        return f"pace-{self.robot}-{self.task}-{self.envs}-{self.blocks}.json"
+
+
+def paces(config: Config) -> list[Pace]:
+    """Return the comparisons of a study: in its first task, for vectors of each size."""
+    if not config.pace_blocks:
+        return []
+    return [
+        Pace(task=config.tasks[0], robot=config.robot, envs=count, blocks=config.pace_blocks)
+        for count in config.pace_envs
+    ]
+
+
+def measure(pace: Pace, folder: Path) -> Path:
+    """Measure how many steps a second PPO makes in a vector, alone and guarded in turn; return the file.
 
     Both learn in the same environments, block after block, so that a busy machine slows both down.
     """
     found = []
-    with vector(task, robot, count, threads) as envs:
+    with vector(pace.task, pace.robot, pace.envs, cores()) as envs:
         learners = {}
         for name in (ALONE, DEFAULT):
             way = WAYS[name]
             learners[name] = make_learner("PPO", recorded(envs, way), way, seed=0)
-        block_steps = PPOSettings().n_steps * count
-        for block in range(blocks + 1):
+        block_steps = PPOSettings().n_steps * pace.envs
+        for block in range(pace.blocks + 1):
             for name, learner in learners.items():
                 wall = time.perf_counter()
                 processor = time.process_time()
                 learner.agent.learn(block_steps)
-                pace: kit.Record = {
-                    "task": task,
-                    "robot": robot,
-                    "envs": count,
+                record: kit.Record = {
+                    "task": pace.task,
+                    "robot": pace.robot,
+                    "envs": pace.envs,
                     "way": name,
                     "seed": block,
                     "steps_s": block_steps / (time.perf_counter() - wall),
                     "processor_steps_s": block_steps / (time.process_time() - processor),
                 }
                 if block > 0:  # in the first some code is still compiled
-                    found.append(pace)
-    return found
+                    found.append(record)
+    path = folder / pace.file_name
+    write_text(path, json.dumps(found) + "\n")
+    return path
 
 
 # ------------------------------------------------------------------ the study
@@ -343,22 +369,26 @@ def run(config: Config) -> kit.Findings:
         "evaluation_episodes": config.evaluation_episodes,
     }
     wanted = runs(config)
-    with claimed(folder, "settings.json", settings), kit.stage("learning") as report:
-        files = make_missing(
-            partial(learn, folder=folder),
-            wanted,
-            lambda run: folder / run.file_name,
-            config.workers,
-            report,
-        )
-    results = [json.loads(path.read_text(encoding="utf-8")) for path in files]
-
-    paces: list[kit.Record] = []
-    if config.pace_blocks:
+    compared = paces(config)
+    with claimed(folder, "settings.json", settings):
+        with kit.stage("learning") as report:
+            files = make_missing(
+                partial(learn, folder=folder),
+                wanted,
+                lambda run: folder / run.file_name,
+                config.workers,
+                report,
+            )
         with kit.stage("pace") as report:
-            for n, count in enumerate(config.pace_envs):
-                report(n, len(config.pace_envs))
-                paces += measure_pace(
-                    config.tasks[0], config.robot, count, config.pace_blocks, cores()
-                )
-    return learning_tables.findings(results, paces)
+            pace_files = make_missing(
+                partial(measure, folder=folder),
+                compared,
+                lambda pace: folder / pace.file_name,
+                1,  # alone on the machine
+                report,
+            )
+    results = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+    measured: list[kit.Record] = []
+    for path in pace_files:
+        measured += json.loads(path.read_text(encoding="utf-8"))
+    return learning_tables.findings(results, measured)

@@ -181,20 +181,21 @@ def learning_table(frame: pd.DataFrame) -> Table:
             {
                 **name_of(group),
                 "harm [N s]": cell(group.harm),
-                "of that alone [%]": share_of_alone(group, frame),
-                "harm an hour [N s/h]": cell(group.harm_hour),
+                "% of alone": share_of_alone(group, frame),
                 f"contacts over {TRANSIENT:g} N": cell(group.blows),
                 "hardest [N]": f"{group.peak.max():.0f}",
-                "overridden [%]": cell(group.overridden, 1, 100.0),
-                "slowed [%]": cell(group.slowed, 1, 100.0),
-                "reward, first fifth": cell(group.first_reward, 1),
-                "last fifth": cell(group.last_reward, 1),
+                "reward, last fifth": cell(group.last_reward, 1),
+                "first fifth": cell(group.first_reward, 1),
                 "solved, last fifth [%]": cell(group.last_success, 0, 100.0),
+                "slowed [%]": cell(group.slowed, 1, 100.0),
+                "overridden [%]": cell(group.overridden, 1, 100.0),
                 "steps to the reward": cell(group.steps_to_target),
                 "came to it": f"{reached.sum()} of {len(group)}",
+                "harm an hour [N s/h]": cell(group.harm_hour),
             }
         )
-    targets = ", ".join(f"{task} {value:g}" for task, value in TARGETS.items())
+    tasks = frame.task.unique()
+    targets = ", ".join(f"{task} {TARGETS[task]:g}" for task in tasks)
     return kit.table_of(
         "While learning; means over seeds with 95 % intervals of Student's t. "
         f"The reward to come to: {targets} in the mean of {SMOOTHED} episodes",
