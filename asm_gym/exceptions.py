@@ -131,7 +131,8 @@ class LimitsLacking(AsmGymError):
     def __str__(self) -> str:
         return (
             f"{self.form} needs {self.needed}; this memory keeps limits of "
-            f"{', '.join(self.kinds) or 'nothing'}; its channels are {', '.join(self.channels)}"
+            f"{', '.join(self.kinds) or 'nothing'}, which the formats table, yaml and json print; "
+            f"its channels are {', '.join(self.channels)}"
         )
 
 

@@ -46,7 +46,7 @@ from asm_gym.evaluation.resampling import Calibration, Windows, Wins, interval, 
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.scoring import fitted
 from asm_gym.evaluation.statistics import Rate, Share, auroc
-from asm_gym.evaluation.tables import Table, tabulate
+from asm_gym.evaluation.tables import Table, plain_cell, tabulate
 from asm_gym.monitors.calibration import AlarmRate
 from tests.streams import sine_episodes
 
@@ -461,6 +461,13 @@ def test_recordings_of_the_same_names_and_other_rows_share_no_fitted_monitor(tmp
 
 
 # ------------------------------------------------------------------ tables
+
+
+@pytest.mark.parametrize("number", ["-1.65", "+2e-3", "-inf", "nan", "4"])
+def test_a_number_in_a_csv_stays_one_and_a_formula_is_quoted(number):
+    assert plain_cell(number) == number
+    assert plain_cell(f"{number}+cmd()").startswith("'" if number[0] in "+-" else number)
+    assert plain_cell("=1+1") == "'=1+1"
 
 
 def test_a_new_column_is_a_heading_and_a_function():

@@ -414,8 +414,11 @@ def test_a_way_to_learn_looks_the_same_in_every_panel_and_the_legend_names_it_on
     ]
     fig = learning_tables.curves_figure(points)
     (legend,) = fig.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["default", "alone"]
+    assert [text.get_text() for text in legend.get_texts()] == ["default guard", "alone"]
     colours = {
-        line.get_color() for ax in fig.axes for line in ax.lines if line.get_label() == "default"
+        line.get_color()
+        for ax in fig.axes
+        for line in ax.lines
+        if line.get_label() == "default guard"
     }
     assert len(colours) == 1

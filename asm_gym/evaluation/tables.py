@@ -91,7 +91,16 @@ def percent(share: Share | None) -> str:
 
 
 def plain_cell(text: str) -> str:
-    """Return a cell of CSV that no spreadsheet takes for a formula: a name that looks like one is quoted."""
-    if text.startswith(tuple(FORMULA)):
+    """Return a cell of CSV that no spreadsheet takes for a formula: what looks like one, and is no number, is quoted."""
+    if text.startswith(tuple(FORMULA)) and not is_number(text):
         return f"'{text}"
     return text
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a number, such as -1.5."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -252,6 +252,7 @@ def pace_table(paces: pd.DataFrame) -> Table:
 def curves_figure(points: Sequence[Record]) -> Figure:
     """Draw reward, success and harm over steps, with a band of a SD, a row of panels for each task and algorithm."""
     frame = pd.DataFrame(points)
+    frame["way"] = frame["way"].replace("default", "default guard")
     motions = list(frame.groupby(["task", "algorithm"], sort=False))
     ways = list(frame["way"].unique())
     known: dict[str, Any] = {}
@@ -265,7 +266,7 @@ def curves_figure(points: Sequence[Record]) -> Figure:
             known |= dict(zip(labels, handles, strict=True))
             left.set(title=f"{task}, {algorithm}: reward", ylim=(0, None))
             middle.set(title="share solved", ylim=(0, 1))
-            right.set(title="harm so far [N s]", yscale="log", ylim=(1, None))
+            right.set(title="harm so far [N s]", yscale="symlog", ylim=(0, None))
         for ax in axes[-1]:
             ax.set_xlabel("control steps")
             ax.locator_params(axis="x", nbins=3)
