@@ -88,7 +88,8 @@ def assert_same_report(ours, theirs, present, stepped):
             np.testing.assert_array_equal(
                 ours["asm"]["attribution"][label][present], shares[present]
             )
-    np.testing.assert_array_equal(ours["cost"][present], theirs["cost"][present])
+    for name in ("cost", "cost_sum", "asm_steps"):
+        np.testing.assert_array_equal(ours[name][present], theirs[name][present], name)
     executed = np.array([list(a) for a in theirs["asm"]["executed_action"][stepped]], np.float32)
     np.testing.assert_array_equal(
         ours["asm"]["executed_action"][stepped].reshape(executed.shape), executed
