@@ -78,6 +78,7 @@ WAYS = {
     "contact limits": Way(guard={"responses": GOING_ON}),
     "speed limit": Way(hand_speed=SLOW),
     "small actions": Way(action_share=SMALL),
+    "small actions, guarded": Way(guard={}, action_share=SMALL),
     "small noise": Way(guard={}, first_spread=SMALL, algorithms=("PPO",)),
     "small noise, alone": Way(first_spread=SMALL, algorithms=("PPO",)),
     "cost in reward": Way(guard={"on_alarm": "monitor"}, price=0.1, algorithms=("PPO",)),
@@ -88,7 +89,7 @@ WAYS = {
 """Ways by name.
 
 - *contact limits* goes on at every alarm that is no pressing, *truncated* truncates the episode at an alarm.
-- *small actions* tells what slow hands alone cost.
+- *small actions* tells what slow hands alone cost; *guarded*, that a full action is as fast as the guard lets it be.
 - *small noise* begins with as much noise as the guard lets through where nothing is near; beside it the same alone.
 - *executed action* is the default guard, and SAC stores what was executed.
 """
@@ -205,11 +206,16 @@ def recorded(envs: VectorEnv[Any, Any, Any], way: Way) -> LearningRecord:
     """Return a vector under the guard of a way, with a record of its episodes."""
     if math.isfinite(way.hand_speed):
         envs = SpeedLimited(envs, way.hand_speed)
-    if way.action_share < 1.0:
-        envs = TransformAction(envs, partial(smaller, way.action_share))
     if way.guard is not None:
         envs = VectorNeuralASMSafety(envs, **way.guard)
     return LearningRecord(envs)
+
+
+def seen_by_learner(record: LearningRecord, way: Way) -> LearnerVector:
+    """Return a recorded vector as the agent of a way steps it."""
+    if way.action_share == 1.0:
+        return LearnerVector(record)
+    return LearnerVector(TransformAction(record, partial(smaller, way.action_share)))
 
 
 def smaller(share: float, actions: Any) -> Any:
@@ -225,9 +231,9 @@ class Learner(NamedTuple):
     callbacks: list[BaseCallback]
 
 
-def make_learner(algorithm: str, envs: LearningRecord, way: Way, seed: int) -> Learner:
+def make_learner(algorithm: str, record: LearningRecord, way: Way, seed: int) -> Learner:
     """Return an untrained agent in a recorded vector."""
-    learned_from: Any = LearnerVector(envs)
+    learned_from: Any = seen_by_learner(record, way)
     callbacks: list[BaseCallback] = []
     if way.price > 0 or way.cost_limit is not None:
         learned_from = PricedCost(learned_from, way.price)
@@ -259,7 +265,7 @@ def learn(run: Run, folder: Path) -> Path:
         period = float(envs.get_attr("dt")[0])
         rounds = math.ceil(run.evaluation_episodes / run.envs)
         trained = {
-            name: play(learner, recorded(envs, WAYS[name]), rounds, run.seed)
+            name: play(learner, recorded(envs, WAYS[name]), way, rounds, run.seed)
             for name in (ALONE, DEFAULT)
         }
     result = {
@@ -275,9 +281,9 @@ def learn(run: Run, folder: Path) -> Path:
     return path
 
 
-def play(learner: Learner, envs: LearningRecord, rounds: int, seed: int) -> kit.Record:
+def play(learner: Learner, record: LearningRecord, way: Way, rounds: int, seed: int) -> kit.Record:
     """Return the columns of ``rounds`` episodes of each member under a trained policy, without exploration."""
-    vector = LearnerVector(envs)
+    vector = seen_by_learner(record, way)
     vector.seed(10_000 + 100 * seed)  # scenes that learning has not begun with
     observations = vector.reset()
     while True:
@@ -285,10 +291,10 @@ def play(learner: Learner, envs: LearningRecord, rounds: int, seed: int) -> kit.
         actions, _ = learner.agent.predict(scaled, deterministic=True)
         observations, *_ = vector.step(actions)
         first: list[kit.Record] = []  # episodes of each member: a member of short ones ends more
-        for number in range(envs.num_envs):
-            own = [each for each in envs.episodes if each["member"] == number]
+        for number in range(record.num_envs):
+            own = [each for each in record.episodes if each["member"] == number]
             first += own[:rounds]
-        if len(first) == rounds * envs.num_envs:
+        if len(first) == rounds * record.num_envs:
             return columns(first)
 
 
