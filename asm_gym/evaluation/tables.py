@@ -91,7 +91,7 @@ def percent(share: Share | None) -> str:
 
 
 def plain_cell(text: str) -> str:
-    """Return a cell of CSV that no spreadsheet takes for a formula: what looks like one, and is no number, is quoted."""
+    """Return a cell of CSV that no spreadsheet takes for a formula: it is quoted unless it is a number."""
     if text.startswith(tuple(FORMULA)) and not is_number(text):
         return f"'{text}"
     return text
