@@ -172,6 +172,15 @@ def test_another_action_space_in_another_process_is_refused():
         envs.close()
 
 
+def test_an_environment_without_a_guard_in_another_process_is_learned_in():
+    envs = SubprocVecEnv([FakeEnv], start_method="spawn")
+    try:
+        agent = ExecutedSAC("MlpPolicy", envs, learning_starts=10, seed=0, buffer_size=64)
+        assert agent.learn(8).replay_buffer.size() == 8
+    finally:
+        envs.close()
+
+
 def test_actions_changed_within_their_space_are_refused_when_they_are_met():
     agent = ExecutedSAC("MlpPolicy", Scales(guarded_fake(()), largest=1.0, share=0.5), seed=0)
     with pytest.raises(UnsupportedEnvironment, match="outside the guard"):
