@@ -122,14 +122,7 @@ class Guard:
         responses = responses_from(options.responses, can_slow=facts.limits_contact)
         self._diagnostician = Diagnostician(spec, diagnosis, responses, self._graded)
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
-        self._decider = RowDecider(
-            table=self.table,
-            terms=self.terms,
-            validator=self._validator,
-            diagnostician=self._diagnostician,
-            arbiter=self._arbiter,
-            graded=self._graded,
-        )
+        self._decider = self._new_decider()
         self._observer = Observer(monitor, facts.count, recalls=self._on_alarm == "recall")
         self._row_judge = self._new_row_judge(motion)
         self._commander = self._new_commander(motion, policies, monitor)
@@ -145,6 +138,17 @@ class Guard:
         self._all_active = True  # the field ``active`` of every record is True
         # What failed when the newest command was chosen, by robot.
         self._command_failures: Mapping[int, str] = NOTHING
+
+    def _new_decider(self) -> RowDecider:
+        """Return what decides about rows."""
+        return RowDecider(
+            table=self.table,
+            terms=self.terms,
+            validator=self._validator,
+            diagnostician=self._diagnostician,
+            arbiter=self._arbiter,
+            graded=self._graded,
+        )
 
     def _new_row_judge(self, motion: FeltMotion | None) -> RowJudge:
         """Return what judges rows in one compiled call."""

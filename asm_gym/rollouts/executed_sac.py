@@ -89,8 +89,9 @@ def guarded_spaces(envs: VecEnv) -> list[gym.Space[Any]]:
     """Return the action spaces of the guards in a learner's vector, also of members in other processes."""
     members = members_of(envs)
     if not members:
-        name = "guarded_action_space"
-        return envs.get_attr(name) if envs.has_attr(name) else []
+        if not envs.has_attr("guarded_action_space"):
+            return []
+        return envs.get_attr("guarded_action_space")
     guards = [layer for member in members for layer in layers(member) if isinstance(layer, GUARDS)]
     return [guard.guarded_action_space for guard in guards]
 

@@ -101,7 +101,8 @@ class SafetyCallback(BaseCallback):
         if self._steps_seen == FIRST_STEPS and 2 * self._stopped_seen > FIRST_STEPS:
             warnings.warn(
                 f"{self._stopped_seen} of the first {FIRST_STEPS} steps of learning are in alarm, "
-                "or a reflex acts: the memory does not know how this agent explores, and the agent learns little. "
+                "or a reflex acts: the memory does not know how this agent explores, and the agent "
+                "learns little. "
                 "Use a memory of the body, as NeuralASMSafety(env) does or asm-gym babble records; "
                 'or on_alarm="monitor", under which nothing is held and no contact is limited',
                 stacklevel=2,

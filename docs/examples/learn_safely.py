@@ -35,9 +35,8 @@ figure = Figure(figsize=(8, 3), layout="constrained")
 left, right = figure.subplots(1, 2)
 for label, guarded in (("alone", False), ("under the guard", True)):
     episodes = learn(guarded)
-    ends = episodes.groupby("step")  # members end together
-    reward = ends.reward.mean().rolling(5, min_periods=1).mean()
-    harm = ends.harm.sum().cumsum()
+    reward = episodes.reward.rolling(20, min_periods=1).mean().groupby(episodes.step).last()
+    harm = episodes.harm.cumsum().groupby(episodes.step).last()
     reward.plot(ax=left, label=label, legend=True, title="reward, mean of 20 episodes")
     harm.plot(ax=right, label=label, legend=True, logy="sym", title="harm so far [N s]")
     hardest = f"hardest contact {episodes.peak.max():.0f} N"

@@ -1,6 +1,8 @@
 """What values are regressed on, and which of it tells each value: not its own past, and of a torque its own arm.
 
-z_t = [x_t, Δ_t, x_{t-l}, φ_t, u_t, 1]      X values, their changes, values l rows before, M features, A commands
+    z_t = [x_t, Δ_t, x_{t-l}, φ_t, u_t, 1]      X values, their changes, values l rows before, M features, A commands
+
+``InputColumns`` says where each part is.
 """
 
 from __future__ import annotations
@@ -54,13 +56,12 @@ class InputColumns:
         """Return where the parts are of so many senses, features and commands."""
         ends = np.cumsum([senses, senses, senses, features])
         parts = np.split(np.arange(ends[-1] + commands, dtype=np.intp), ends)
-        values, changes, before, of_features, of_commands = parts
         return cls(
-            values=values,
-            changes=changes,
-            before=before,
-            features=of_features,
-            commands=of_commands,
+            values=parts[0],
+            changes=parts[1],
+            before=parts[2],
+            features=parts[3],
+            commands=parts[4],
         )
 
     def withheld(self, groups: Places, features: ArmFeatures) -> list[Places]:
@@ -104,7 +105,8 @@ class InputColumns:
             speeds = accelerations
         found = []
         for joint in range(joints):
-            friction, body = np.split(of_joints[:, joint], [len(WIDTHS)])
+            friction = of_joints[: len(WIDTHS), joint]
+            body = of_joints[len(WIDTHS) :, joint]
             common = [speeds[[joint]], friction, self.commands]
             by_sines = [sines, accelerations]
             by_body = [body, accelerations[[joint]]]

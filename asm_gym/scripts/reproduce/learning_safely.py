@@ -3,7 +3,7 @@
 PPO and SAC of stable-baselines3 learn four motions alone, under guards, and with the cost of alarms in the reward.
 Harm is the contact force on the arm beyond 40 N, summed over all physics substeps of learning [N s], from the
 simulator. Every run has a file of its own: the same command continues after a kill. A run of PPO takes about
-1.5 minutes of one core and one of SAC six, the whole study some five hours of two cores, by estimate.
+1.5 minutes of one core and one of SAC five, the whole study some five hours of two cores, by estimate.
 """
 
 from __future__ import annotations
